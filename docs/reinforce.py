@@ -15,7 +15,7 @@ from torch import Tensor
 
 from esp_cli.algorithms.adam import SeedAdam
 from esp_cli.algorithms.learner import Iteration, Learner, LearnerConfig
-from esp_cli.algorithms.losses import normalise_per_seed
+from esp_cli.algorithms.objectives import normalise_per_seed
 from esp_cli.algorithms.rollout import Collector
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.policy import StochasticPolicy

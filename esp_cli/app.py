@@ -21,7 +21,7 @@ from esp_cli import console, machine
 from esp_cli.commands import COMMANDS
 from esp_cli.commands.help import arrange
 from esp_cli.defaults import __version__
-from esp_cli.files import failures
+from esp_cli.files import formatting
 from esp_cli.files.formatting import did_you_mean
 from esp_envs.errors import UserError
 
@@ -42,11 +42,9 @@ class LazyGroup(TyperGroup):
     """A command group over `COMMANDS` that imports a command's module only when the command is asked for."""
 
     def list_commands(self, ctx: typer.Context) -> list[str]:  # type: ignore[override] # same class, public name
-        """Return the names in the order of the table."""
         return list(COMMANDS)
 
     def get_command(self, ctx: typer.Context, cmd_name: str) -> Any:  # type: ignore[override]
-        """Import and build one command; None where the table does not name it."""
         return build_command(cmd_name, COMMANDS[cmd_name]) if cmd_name in COMMANDS else None
 
     def resolve_command(self, ctx: typer.Context, args: list[str]) -> Any:  # type: ignore[override]
@@ -111,7 +109,7 @@ def build_command(name: str, target: str) -> Any:
 def report(failure: Exception | SystemExit) -> int | None:
     """Print the sentence that a failure deserves and return its exit code; None where it is a bug without one."""
     if isinstance(failure, typer.TyperException):
-        message, context = failures.own_words(failure.format_message()), getattr(failure, "ctx", None)
+        message, context = formatting.own_words(failure.format_message()), getattr(failure, "ctx", None)
         if message:  # empty where no argument was given at all: typer has shown the help already
             hint = _OTHER_NAMES.get(getattr(failure, "option_name", ""))
             message = f"{message.split(' (')[0]}; {hint}" if hint else message
@@ -126,8 +124,8 @@ def report(failure: Exception | SystemExit) -> int | None:
         console.error(_sentence(cast("UserError | ValidationError", failure)))
         return EXIT_USER
     if isinstance(failure, OSError) and failure.errno is not None:
-        console.error(failures.sentence(failure))
-        return EXIT_USER if failures.is_correctable(failure) else EXIT_MACHINE
+        console.error(formatting.sentence(failure))
+        return EXIT_USER if formatting.is_correctable(failure) else EXIT_MACHINE
     installed = sys.modules.get("esp_envs.installed")  # not imported: then no code of the user ran
     place = None if installed is None else installed.raised_in(failure)
     if installed is None or place is None:
@@ -143,7 +141,7 @@ def _sentence(failure: UserError | ValidationError) -> str:
     found = []
     for item in failure.errors(include_url=False):
         where = ".".join(str(part) for part in item["loc"])
-        message = failures.own_words(item["msg"])
+        message = formatting.own_words(item["msg"])
         told = f"setting '{where}': {message} (got {item['input']!r})" if where else message
         found.append(f"there is no setting '{where}'" if item["type"] == "extra_forbidden" else told)
     return f"{failure.title}: {'; '.join(found)}"

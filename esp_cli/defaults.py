@@ -8,8 +8,7 @@ __version__ = "0.1.0"
 
 PriorKind = Literal["esp", "none", "augment", "consistency"]
 """What a prior consists of, in the order in which a task's bundled policies are preferred."""
-Mode = Literal["greedy", "stochastic"]
-"""How a policy acts: by its most probable action, or by actions that it draws."""
+Mode = Literal["greedy", "stochastic"]  # how a policy acts: by its most probable action, or by actions that it draws
 STEPS = 1_000_000  # environment steps per seed of a run
 EPISODES = 320  # of an evaluation, per seed
 STUDY_SEEDS = tuple(range(10))  # as many as the paper has

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from esp_cli.algorithms.learner import Learner
-from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.checking.measured import prepared
 from esp_cli.defaults import EPISODES, STEPS
 from esp_cli.files.formatting import file_name
@@ -32,9 +32,9 @@ from esp_cli.policies.loaded import LoadedPolicy, register_own
 from esp_cli.policies.loading import Start, TrainedPolicy
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config
-from esp_cli.training.config_file import parse_config
 from esp_cli.training.metrics import Metrics, read_metrics
 from esp_cli.training.run_folder import RunFolder, RunFolderError
+from esp_cli.training.settings import parse_config
 from esp_cli.training.trackers import require
 from esp_cli.training.trainer import Listener, Trainer
 from esp_envs.base import Environment

@@ -26,7 +26,7 @@ settings.load_profile("esp")
 @pytest.fixture(scope="module", autouse=True)
 def nothing_left() -> Iterator[None]:
     """Take back what a module's tests registered, and let no learner choose kernels by itself."""
-    from esp_cli.algorithms.registry import ALGORITHMS
+    from esp_cli.algorithms.presets import ALGORITHMS
     from esp_cli.networks import plain
     from esp_cli.networks.build import NETWORKS
     from esp_envs import installed

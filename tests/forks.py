@@ -15,7 +15,7 @@ import scipy.stats  # noqa: F401 - the end of a run needs it, and importing take
 import torch.profiler  # noqa: F401 - so does the first step of an optimizer
 
 from esp_cli import app
-from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.networks.build import NETWORKS
 from esp_cli.studies import engine
 from esp_envs.registry import TASKS

@@ -173,7 +173,7 @@ def test_both_packages_are_looked_at() -> None:
         ("esp_cli/symmetry/__init__.py", "from ..training import loop", "symmetry may not import training"),
         ("esp_cli/prior/losses.py", "from esp_cli.networks.layers import Linear", "prior may not import networks"),
         ("esp_cli/algorithms/mappo.py", "from esp_cli import training", "algorithms may not import training"),
-        ("esp_cli/algorithms/registry.py", "T = {'a': 'esp_cli.training.loop:run'}", "may not import training"),
+        ("esp_cli/algorithms/learner.py", "T = {'a': 'esp_cli.training.loop:run'}", "may not import training"),
         ("esp_cli/training/loop.py", "def f():\n    import esp_cli.commands.train", "training may not import commands"),
         ("esp_cli/training/loop.py", "from esp_cli.console import say", "esp_cli.console belongs in"),
         ("esp_cli/training/loop.py", "from rich.table import Table", "rich belongs in"),

@@ -16,8 +16,7 @@ from esp_envs.spec import Discrete, TaskSpec
 
 World = dict[str, Tensor]
 """The tensors of all worlds by the name of their field in `spec.state`: [S, E, items, numbers of an item]."""
-Outcome = tuple[Tensor, dict[str, Tensor]]
-"""The reward [S, E] or [S, E, N] of a step and its metrics [S, E]."""
+Outcome = tuple[Tensor, dict[str, Tensor]]  # the reward [S, E] or [S, E, N] of a step and its metrics [S, E]
 _FURTHER = "world."  # what the names of saved tensors begin with that are no fields of the state
 
 
@@ -103,17 +102,11 @@ class BatchedTask(Environment):
         return torch.stack(drawn) if generator is None else drawn[0]
 
     def reset(self) -> Observation:
-        """Start a new episode in every world."""
         self._time, self._episode_time = 0, torch.zeros_like(self._episode_time)
         self._begin_with(self._episodes())
         return self._seen()
 
     def step(self, action: Tensor) -> Step:
-        """Advance every world by one step.
-
-        Raises:
-            UserError: the action has another shape than [S, E, N] (discrete) or [S, E, N, width] (continuous).
-        """
         require_shape("joint action", action, self.action_shape)
         reward, metrics = self._play(action)
         reached, horizon = self._seen(), self.spec.horizon
@@ -133,11 +126,6 @@ class BatchedTask(Environment):
         return Step(following, reward, terminated, truncated, final, metrics)
 
     def set_state(self, state: Tensor) -> Observation:
-        """Put every world into a global state at the start of an episode.
-
-        Raises:
-            UserError: the state has another shape than [S, E, state width].
-        """
         require_shape("state", state, self.state_shape)
         self._time, self._episode_time = 0, torch.zeros_like(self._episode_time)
         self._put(state)
@@ -152,11 +140,6 @@ class BatchedTask(Environment):
         return saved | clock | super().state_dict()
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
-        """Go on bit for bit from what `state_dict` returned.
-
-        Raises:
-            UserError: the tensors belong to an environment of another size.
-        """
         shapes = {name: tensor.shape for name, tensor in tensors.items()}
         own = {name: value.shape for name, value in self.state_dict().items()}
         if any(shapes.get(name) != shape for name, shape in own.items() if not name.startswith(_FURTHER)):
@@ -168,7 +151,6 @@ class BatchedTask(Environment):
             self._episode_time = tensors["time"].to(self.device).clone()
 
     def action_mask(self) -> Tensor | None:
-        """Return which actions each agent may take now; None where `spec.masks` is off."""
         choices = self.spec.action.count if isinstance(self.spec.action, Discrete) else 0
         return self._switched("_allow", "masks", (*self._agents_shape, choices))
 
@@ -193,7 +175,6 @@ class BatchedTask(Environment):
         return self._episodes()
 
     def _renew(self, ended: Tensor) -> None:
-        """Begin a new episode in the worlds [S, E] that have ended."""
         fresh = self._next_episodes()
         for name, value in fresh.items():
             over = ended.view(*ended.shape, *(1,) * (value.dim() - 2))
@@ -259,7 +240,6 @@ class BatchedTask(Environment):
         return flags.contiguous().clone()
 
     def _named(self, method: str, named: object) -> Mapping[str, Tensor]:
-        """Refuse what a method of a subclass gives instead of tensors by name."""
         if not isinstance(named, Mapping):
             raise UserError(
                 f"'{method}' of {self.spec.name} gives {type(named).__name__}; give a dict of tensors by name"

@@ -51,17 +51,14 @@ class Compass(Environment):
         self._stated = torch.cat([frame, label])
 
     def reset(self) -> Observation:
-        """Start a new episode in every world."""
         return self._framed(self.inner.reset())
 
     def step(self, action: Tensor) -> Step:
-        """Advance every world by one step."""
         step = self.inner.step(action)
         final = None if step.final is None else self._framed(step.final)
         return replace(step, next=self._framed(step.next), final=final)
 
     def set_state(self, state: Tensor) -> Observation:
-        """Put every world into a global state; its frame is left out."""
         own = self.inner.spec
         if self._joint:
             rows = state.unflatten(-1, (own.num_agents, -1))

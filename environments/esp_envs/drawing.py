@@ -32,9 +32,6 @@ def draw(scene: Scene, size: int = 320, trail: Sequence[Scene] = ()) -> NDArray[
         scene: what to draw.
         size: pixels of the longer side; the other follows from the scene's window.
         trail: earlier scenes of the same world, oldest first; bodies that leave a trail get one.
-
-    Raises:
-        UserError: the size is below 16 pixels, the window is empty, or a body has an unknown shape.
     """
     x_min, x_max, y_min, y_max = scene.window
     if size < 16 or x_max <= x_min or y_max <= y_min:
@@ -59,7 +56,6 @@ class TopPainter:
         self._size, self.note = size, note
 
     def draw(self, scene: Scene, trail: Sequence[Scene] = ()) -> NDArray[np.uint8]:
-        """Draw one scene; see the function `draw`."""
         return draw(scene, self._size, trail)
 
 
@@ -90,7 +86,6 @@ class _Canvas:
         self._draw = ImageDraw.Draw(self._image)
 
     def grid(self, spacing: float, offset: float) -> None:
-        """Draw grid lines and a frame."""
         x_min, x_max, y_min, y_max = self._window
         lines = [((x, y_min), (x, y_max)) for x in _lines(x_min, x_max, spacing, offset)]
         for line in (*lines, *(((x_min, y), (x_max, y)) for y in _lines(y_min, y_max, spacing, offset))):
@@ -99,7 +94,6 @@ class _Canvas:
         self._draw.rectangle((0, 0, width - 1, height - 1), outline=FRAME, width=_OVERSAMPLING)
 
     def trail(self, path: Sequence[Point], body: Body) -> None:
-        """Draw the way a body has come, fading towards its beginning."""
         width = max(1, round(body.radius * TRAIL_WIDTH * self._scale))
         pieces = len(path) - 1
         for k in range(pieces):
@@ -109,7 +103,6 @@ class _Canvas:
             self._draw.ellipse(_box(x, y, width / 2), fill=color)
 
     def body(self, body: Body) -> None:
-        """Draw a body with its rim and, where it has a heading, a nose mark."""
         if body.shape not in _SHAPES:
             raise UserError(f"cannot draw a body of shape '{body.shape}'; the shapes are {', '.join(_SHAPES)}")
         x, y = self._at(body.position)
@@ -131,7 +124,6 @@ class _Canvas:
             self._draw.line([(x, y), tip], fill=rim, width=thick)
 
     def pixels(self) -> NDArray[np.uint8]:
-        """Return the picture at its final size."""
         return np.asarray(self._image.resize(self._size, Image.Resampling.BOX), dtype=np.uint8).copy()
 
     def _line(self, points: Sequence[Point], color: str | _Color, width: int) -> None:
@@ -152,5 +144,4 @@ def _box(x: float, y: float, radius: float) -> tuple[float, float, float, float]
 
 
 def _mix(first: _Color, second: _Color, share: float) -> _Color:
-    """Return a colour `share` of the way from the first to the second."""
     return tuple(round(a + (b - a) * share) for a, b in zip(first[:3], second[:3], strict=True))

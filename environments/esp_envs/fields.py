@@ -231,11 +231,7 @@ class Layout:
 
     @cached_property
     def families(self) -> tuple[Family, ...]:
-        """The sets of like things, in the order of their first fields.
-
-        Raises:
-            UserError: fields of one family have different numbers of items.
-        """
+        """The sets of like things, in the order of their first fields; items of one family have to be as many."""
         joined: dict[str, list[Placed]] = {}
         for field, where in self._placed:
             if field.width and field.family_name:

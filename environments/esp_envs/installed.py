@@ -68,11 +68,7 @@ class Registry(Mapping[str, type[T]]):
         return name
 
     def __getitem__(self, name: str) -> type[T]:
-        """Return a class by its name, imported if it is built in or installed.
-
-        Raises:
-            UserError: there is no such class, or it is neither installed nor registered.
-        """
+        """Return a class by its name, imported if it is built in or installed."""
         if name in self._registered:
             return self._registered[name]
         if name in self._built_in:

@@ -164,12 +164,10 @@ class ParallelView(ParallelEnv):  # type: ignore[misc]  # pettingzoo may be miss
         return self._by_agent(seen.obs), infos
 
     def _by_agent(self, x: torch.Tensor) -> dict[str, _Array]:
-        """Return the row of each agent that acts, of [1, 1, N, ...]."""
         rows = dict(zip(self.possible_agents, x[0, 0].numpy(), strict=True))
         return {agent: rows[agent].copy() for agent in self.agents}
 
     def _living(self, observation: Observation, agents: list[str]) -> list[str]:
-        """Return those of some agents that have not ended."""
         if observation.alive is None:
             return list(agents)
         alive = dict(zip(self.possible_agents, observation.alive[0, 0].tolist(), strict=True))

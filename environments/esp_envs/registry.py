@@ -18,7 +18,7 @@ TASKS: Registry[Environment] = Registry(
         "navigation": "esp_envs.mpe.navigation:Navigation",
         "predator-prey": "esp_envs.mpe.predator_prey:PredatorPrey",
         "formation": "esp_envs.epuck.formation:Formation",
-        "wildlife": "esp_envs.wildlife.wildlife:Wildlife",
+        "wildlife": "esp_envs.wildlife:Wildlife",
     },
     base="esp_envs.base:Environment",
     option="--task",

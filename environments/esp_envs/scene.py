@@ -68,8 +68,4 @@ class Painter(Protocol):
     note: str | None
 
     def draw(self, scene: Scene, trail: Sequence[Scene] = ()) -> NDArray[np.uint8]:
-        """Draw one scene with the trails that bodies left in earlier scenes of the same world, oldest first.
-
-        Shape:
-            [H, W, 3] uint8, red, green and blue; the first row is the top.
-        """
+        """Draw one scene with the trails of earlier ones, oldest first: [H, W, 3] uint8, RGB, the top row first."""

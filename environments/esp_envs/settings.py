@@ -27,14 +27,7 @@ class Breaks:
 
 
 def remaining(whole: str, broken: Iterable[Breaks]) -> str:
-    """Return the symmetry that is left where several things break it: "flip-x*agents", "c1" for none.
-
-    Two that leave different planar groups are taken to leave none of the plane.
-
-    Args:
-        whole: the symmetry without them, "d4*agents".
-        broken: each with the name of the planar group that it leaves.
-    """
+    """Return the symmetry that is left where several things break it: "flip-x*agents", "c1" for none."""
     real = list(broken)
     planes = {one.plane for one in real if one.plane is not None}
     plane, *rest = whole.split("*")

@@ -79,11 +79,6 @@ class Continuous:
     layout: Layout
 
     def __post_init__(self) -> None:
-        """Refuse what is no vector of numbers.
-
-        Raises:
-            UserError: a field is a picture, a ring or a record.
-        """
         for part in self.layout.fields:
             if part.kind in (Kind.PICTURE, Kind.RING, Kind.RECORD):
                 raise UserError(f"an action cannot hold '{part.name}', a {part.kind.name}; give vectors and numbers")
@@ -176,7 +171,6 @@ class TaskSpec(Spaces):
 
     @property
     def label(self) -> str:
-        """What messages call the task."""
         return self.name
 
     def __post_init__(self) -> None:

@@ -18,9 +18,6 @@ BETAS = (0.9, 0.999)
 class SeedParameters:
     """Parameters of S seeds as views of one buffer; changing the buffer changes the networks.
 
-    Args:
-        parameters: [S, ...] each.
-
     Attributes:
         parameters: as given.
         buffer: [S, P] all numbers of a seed in a row.
@@ -142,11 +139,6 @@ class SeedAdam:
         return out
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
-        """Restore what `state_dict` returned.
-
-        Raises:
-            KeyError: the moments are of other parameters.
-        """
         shapes = {f"{k}.step": self.count.shape for k in range(len(self.parameters.parameters))}
         for k, parameter in enumerate(self.parameters.parameters):
             shapes |= {f"{k}.exp_avg": parameter.shape, f"{k}.exp_avg_sq": parameter.shape}

@@ -36,12 +36,7 @@ class LearnerConfig(Strict):
     num_envs: int
 
     def without_effect(self, network: NetworkConfig, spec: Callable[[], TaskSpec]) -> frozenset[str]:
-        """Return the names of settings that change nothing beside the others.
-
-        Args:
-            network: shape of the networks.
-            spec: makes the contract of the task, which takes worlds; called only where a setting depends on it.
-        """
+        """Return the names of settings that change nothing beside the others; `spec` makes the task's contract."""
         return frozenset()
 
 
@@ -131,11 +126,7 @@ class Learner(ABC):
 
     @abstractmethod
     def iterate(self, progress: float) -> Iteration:
-        """Collect, learn, and return what came out.
-
-        Args:
-            progress: share of the run that is done, 0 to 1, for schedules.
-        """
+        """Collect, learn, and return what came out; `progress` is the share of the run that is done, 0 to 1."""
 
     def iteration(self, metrics: dict[str, Tensor], *watched: Tensor) -> Iteration:
         """Return metrics with the flags that say in which seeds all the watched numbers, [S] each, are finite."""
@@ -148,11 +139,7 @@ class Learner(ABC):
             optimiser.anneal(remaining)
 
     def state_dict(self, complete: bool = False) -> dict[str, Tensor]:
-        """Return everything that a resumed run needs to go on bit for bit, as flat tensors.
-
-        Args:
-            complete: the run has come to its end, so what only further learning needs may be left out.
-        """
+        """Return flat tensors that a resumed run needs; once `complete`, less what only further learning needs."""
         out: dict[str, Tensor] = {}
         for name, module in self.modules.items():
             out |= {f"{name}.{key}": value for key, value in module.state_dict().items()}

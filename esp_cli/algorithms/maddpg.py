@@ -19,9 +19,8 @@ from esp_cli.algorithms.objectives import value_loss
 from esp_cli.algorithms.off_policy import ExploringConfig, ExploringLearner
 from esp_cli.algorithms.replay import EpisodeBatch
 from esp_cli.networks.build import perceptron
-from esp_cli.networks.contract import NetworkConfig
+from esp_cli.networks.contract import IoSpec, NetworkConfig
 from esp_cli.networks.exploration import ActorHead, ExploringCategorical, build_actor_head
-from esp_cli.networks.io_spec import IoSpec
 from esp_cli.networks.joint_q import PerAgentCriticInput
 from esp_cli.networks.plain import MLP
 from esp_cli.networks.policy import POLICY_GAIN, HistoryPolicy
@@ -54,10 +53,7 @@ class MaddpgConfig(ExploringConfig):
 
 
 class Maddpg(ExploringLearner):
-    """The learner: actor, centralised critic, their targets, optimisers and prior; arguments as of `Learner`.
-
-    The critic is a plain perceptron whatever the actors are: it sees all that there is to see at a step.
-    """
+    """The learner: actor, centralised critic, their targets, optimisers and prior; arguments as of `Learner`."""
 
     config_class = MaddpgConfig
     watched = ("td_loss", "policy_loss", "critic_grad_norm", "actor_grad_norm")

@@ -17,14 +17,19 @@ from torch import Tensor
 
 from esp_cli.algorithms.adam import SeedAdam
 from esp_cli.algorithms.learner import Iteration, Learner, LearnerConfig
-from esp_cli.algorithms.losses import beside, explained_variance, gae, normalise_per_seed
 from esp_cli.algorithms.normalisation import ValueNormaliser
-from esp_cli.algorithms.objectives import clipped_surrogate, ppo_loss, value_loss
+from esp_cli.algorithms.objectives import (
+    beside,
+    clipped_surrogate,
+    explained_variance,
+    gae,
+    normalise_per_seed,
+    ppo_loss,
+    value_loss,
+)
 from esp_cli.algorithms.rollout import Batch, Collector, Rollout, values_along
-from esp_cli.networks.contract import NetworkConfig, WithVJP
-from esp_cli.networks.critic import Critic
-from esp_cli.networks.io_spec import Reads
-from esp_cli.networks.policy import StochasticPolicy
+from esp_cli.networks.contract import NetworkConfig, Reads, WithVJP
+from esp_cli.networks.policy import Critic, StochasticPolicy
 from esp_cli.prior import Answers, Copies, Loss, mean_per_seed
 from esp_envs.base import Environment
 from esp_envs.errors import UserError
@@ -195,7 +200,6 @@ class Mappo(Learner):
         return x.unflatten(2, (-1, length)).flatten(1, 2)
 
     def _remember_old_networks(self) -> None:
-        """Keep the networks that collected the rollout, where copies are evaluated under them."""
         needed = self.prior.augments and (self.prior.recomputes or self.config.clip_value)
         self._old = (copy.deepcopy(self.policy), copy.deepcopy(self.critic)) if needed else None
 
@@ -217,7 +221,6 @@ class Mappo(Learner):
         return copied
 
     def _minibatches(self, batch: Batch) -> list[Batch]:
-        """Shuffle the sequences of each seed by its own generator and cut them into minibatches."""
         count, parts = batch.obs.shape[1], self.config.num_minibatches
         if parts == 1:
             return [batch]
@@ -259,7 +262,6 @@ class Mappo(Learner):
         return loss + copies.penalty(policy=(head, outputs), value=values)
 
     def _value_loss(self, values: WithVJP | Tensor, copies: Copies[Batch]) -> Loss:
-        """Return the critic's loss (Eq. 4)."""
         config = self.config
         clip = config.clip_epsilon if config.clip_value else None
         return value_loss(values, copies.originals.target, copies, config.huber_delta, clip)

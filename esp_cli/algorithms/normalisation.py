@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from esp_cli.algorithms.losses import beside
+from esp_cli.algorithms.objectives import beside
 from esp_cli.prior import mean_per_seed
 
 _SMALLEST = 1e-6  # the least standard deviation: of rewards that are all 0, say
@@ -74,7 +74,6 @@ class ValueNormaliser(nn.Module):
         self.mean.add_(share * step)
 
     def normalise(self, x: Tensor) -> Tensor:
-        """Return (x - mean) / deviation."""
         return ((x - beside(self.mean, x)) / self._deviation(x)).to(x.dtype)
 
     def scaled(self, x: Tensor) -> Tensor:
@@ -82,7 +81,6 @@ class ValueNormaliser(nn.Module):
         return (x / torch.hypot(beside(self.mean, x), self._deviation(x))).to(x.dtype)
 
     def denormalise(self, x: Tensor) -> Tensor:
-        """Return x * deviation + mean."""
         return (x * self._deviation(x) + beside(self.mean, x)).to(x.dtype)
 
     def _deviation(self, like: Tensor) -> Tensor:

@@ -11,9 +11,8 @@ from torch import Tensor, nn
 
 from esp_cli.algorithms.adam import SeedAdam
 from esp_cli.algorithms.learner import Iteration, Learner, LearnerConfig, below
-from esp_cli.algorithms.losses import td_targets
 from esp_cli.algorithms.normalisation import ValueNormaliser
-from esp_cli.algorithms.objectives import value_loss
+from esp_cli.algorithms.objectives import td_targets, value_loss
 from esp_cli.algorithms.replay import EpisodeBatch, EpisodeCollector, EpisodeReplay
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.exploration import ExploringHead
@@ -62,10 +61,6 @@ class OffPolicyLearner(Learner):
     The policy draws its actions as its head does; see `ExploringLearner` for a schedule of exploration.
 
     Arguments as of `Learner`.
-
-
-    Raises:
-        UserError: the replay cannot hold what one round collects.
     """
 
     replays = True
@@ -141,7 +136,6 @@ class OffPolicyLearner(Learner):
         return {}
 
     def _store(self, episodes: EpisodeBatch) -> None:
-        """Remember episodes and, where the prior says so, their copies; originals alone enter the statistics."""
         valid = episodes.valid.unsqueeze(-1).expand(episodes.reward.shape)
         if episodes.reward.shape[-1] > 1:
             valid = episodes.of_living(valid)

@@ -1,4 +1,4 @@
-"""Presets: what `--preset` and the task change in the defaults of an algorithm, a network, the prior and evaluation.
+"""The algorithms by name, and presets: what `--preset` and the task change in the defaults.
 
 `PRESETS` holds settings by algorithm, preset and section. `TUNED` holds what the preset `default` changes on a task:
 the settings that measured best there; `PAPER` is the same for the preset `paper`. `FAST` holds what the preset `fast`
@@ -8,7 +8,25 @@ config class.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from esp_envs.errors import UserError
+from esp_envs.installed import Registry
+
+if TYPE_CHECKING:
+    from esp_cli.algorithms.learner import Learner
+
+ALGORITHMS: Registry[Learner] = Registry(
+    "algorithm",
+    {
+        "mappo": "esp_cli.algorithms.mappo:Mappo",
+        "maddpg": "esp_cli.algorithms.maddpg:Maddpg",
+        "qmix": "esp_cli.algorithms.qmix:Qmix",
+    },
+    base="esp_cli.algorithms.learner:Learner",
+    option="--algo",
+    example="reinforce:Reinforce",
+)
 
 Sections = dict[str, dict[str, object]]  # settings by section: the algorithm's name, "network", "prior" or "evaluation"
 
@@ -115,11 +133,7 @@ PAPER: dict[str, dict[str, Sections]] = {"mappo": {"formation": {"mappo": {"num_
 
 
 def preset_layers(task: str, algorithm: str, preset: str) -> list[Sections]:
-    """Return the settings of a preset on a task, layer by layer; a later one has the last word.
-
-    Raises:
-        UserError: the algorithm has no such preset, or has none called fast for this task.
-    """
+    """Return the settings of a preset on a task, layer by layer; a later one has the last word."""
     presets, fast = PRESETS.get(algorithm, {"default": {}}), FAST.get(algorithm, {})
     if preset == "fast" and fast:
         if task not in fast:

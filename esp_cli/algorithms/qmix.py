@@ -21,11 +21,10 @@ from esp_cli.algorithms.objectives import value_loss
 from esp_cli.algorithms.off_policy import ExploringConfig, ExploringLearner
 from esp_cli.algorithms.replay import EpisodeBatch
 from esp_cli.networks.build import perceptron
-from esp_cli.networks.contract import NetworkConfig
+from esp_cli.networks.contract import IoSpec, NetworkConfig
 from esp_cli.networks.exploration import EpsilonGreedy
 from esp_cli.networks.heads import best
-from esp_cli.networks.io_spec import IoSpec
-from esp_cli.networks.mixer import MonotonicMixer
+from esp_cli.networks.joint_q import MonotonicMixer
 from esp_cli.networks.policy import HistoryPolicy
 from esp_cli.prior import Answers
 from esp_envs.base import Environment
@@ -76,7 +75,6 @@ class Qmix(ExploringLearner):
     def build_policy(
         cls, spec: TaskSpec, network: NetworkConfig, generators: Sequence[torch.Generator]
     ) -> HistoryPolicy:
-        """Return new epsilon-greedy policies."""
         if not isinstance(spec.action, Discrete):
             raise UserError(
                 f"qmix chooses among discrete actions, but those of this {spec.name} are continuous; "
@@ -85,7 +83,6 @@ class Qmix(ExploringLearner):
         return HistoryPolicy(spec, network, generators, EpsilonGreedy(spec.action, len(generators)), VALUE_GAIN)
 
     def update(self, batch: EpisodeBatch) -> dict[str, Tensor]:
-        """Take one gradient step down L_TD + c S_Q."""
         copies = self.prior.copies(batch, self.generators["prior"])
         utilities = self._utilities(copies.rows)
         seen = self.critic_rows(copies.rows)

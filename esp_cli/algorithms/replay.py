@@ -43,12 +43,7 @@ class EpisodeBatch(SeedBatch):
         return self.valid
 
     def of_living(self, x: Tensor, after: bool = False) -> Tensor:
-        """Return numbers per agent [S, B, T, N] or [S, B, T, N, width], 0 where the agent has ended.
-
-        Args:
-            x: of the T steps.
-            after: whether x belongs to the states after the steps.
-        """
+        """Return numbers per agent [S, B, T, N(, width)], 0 where one has ended before the step, or `after` it."""
         if self.alive is None:
             return x
         alive = self.alive[:, :, 1:] if after else self.alive[:, :, :-1]
@@ -56,10 +51,7 @@ class EpisodeBatch(SeedBatch):
 
 
 class EpisodeReplay:
-    """The last `capacity` episodes of each of S seeds, allocated at once on the training device.
-
-    All seeds write in step, so one cursor serves them all; nothing else is shared between seeds.
-    """
+    """The last `capacity` episodes of each of S seeds, allocated at once on the training device."""
 
     def __init__(self, spec: TaskSpec, num_seeds: int, capacity: int, device: torch.device) -> None:
         self.capacity, self.size, self.cursor = capacity, 0, 0
@@ -114,12 +106,10 @@ class EpisodeReplay:
         return self.select(torch.stack(places).to(self._store.obs.device, non_blocking=True))
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the filled part and the cursor."""
         filled = {name: tensor[:, : self.size] for name, tensor in self._store.tensors.items()}
         return filled | {"cursor": torch.tensor(self.cursor)}
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
-        """Restore what `state_dict` returned."""
         if tensors.keys() != {*self._store.tensors, "cursor"} or tensors["obs"].dim() < 2:
             raise UserError("the saved episodes do not fit into the replay of this configuration")
         size = tensors["obs"].shape[1]
@@ -132,10 +122,7 @@ class EpisodeReplay:
 
 
 class EpisodeCollector:
-    """Plays one episode in every world at a time, each from a fresh start.
-
-    What a world does after its episode has ended before the horizon is marked as not valid.
-    """
+    """Plays one episode in every world at a time, each from a fresh start."""
 
     def __init__(self, env: Environment, policy: HistoryPolicy, generators: Sequence[torch.Generator]) -> None:
         self.env, self.policy, self.generators = env, policy, generators
@@ -183,5 +170,4 @@ class EpisodeCollector:
         return {f"env.{name}": tensor for name, tensor in self.env.state_dict().items()}
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
-        """Restore what `state_dict` returned."""
         self.env.load_state_dict(below(tensors, "env"))

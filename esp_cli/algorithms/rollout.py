@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.algorithms.learner import below
-from esp_cli.networks.critic import Critic
-from esp_cli.networks.policy import StochasticPolicy
+from esp_cli.networks.policy import Critic, StochasticPolicy
 from esp_cli.prior import SeedBatch
 from esp_envs.base import Environment, Observation
 from esp_envs.errors import UserError
@@ -141,7 +140,6 @@ class Collector:
         return {name: tensor for name, tensor in own.items() if tensor is not None} | worlds
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
-        """Restore what `state_dict` returned."""
         if not self.env.has("state_dict"):
             self.env.load_state_dict(below(tensors, "env"))
             self._stale = True  # the next rollout begins new episodes

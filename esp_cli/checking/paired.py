@@ -37,7 +37,7 @@ from esp_cli.checking.verdicts import (
 )
 from esp_cli.symmetry import Element, Transform, build_transform
 from esp_envs.base import Environment, Observation, Step
-from esp_envs.conformance.subject import MakeWorlds
+from esp_envs.promises import MakeWorlds
 from esp_envs.spec import Layout, TaskSpec
 
 _MOST_WORLDS = 256

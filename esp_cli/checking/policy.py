@@ -13,8 +13,8 @@ from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.symmetry import build_transform
 from esp_cli.training.build import with_compass
 from esp_envs.base import Observation
-from esp_envs.conformance.subject import MakeWorlds
 from esp_envs.errors import UserError
+from esp_envs.promises import MakeWorlds
 
 _WORLDS, _STEPS = 64, 10
 _CLOSE = 0.1

@@ -16,7 +16,7 @@ from esp_cli.symmetry import Element
 from esp_cli.symmetry.admission import scene_of
 from esp_cli.symmetry.elements import AGENTS
 from esp_envs.base import Environment
-from esp_envs.conformance.subject import MakeWorlds
+from esp_envs.promises import MakeWorlds
 from esp_envs.spec import Spaces
 
 PAIRED, TRANSITIONS = "paired states", "transitions"

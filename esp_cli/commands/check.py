@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from esp_cli.checking import ElementVerdict, PolicyVerdict, SymmetryReport
     from esp_envs import Environment
     from esp_envs.conformance import Finding
-    from esp_envs.conformance.subject import MakeWorlds
+    from esp_envs.promises import MakeWorlds
     from esp_envs.spec import TaskSpec
 
 EPILOG = """Examples:\n
@@ -149,7 +149,6 @@ def print_elements(report: SymmetryReport, found: str) -> None:
 
 
 def _where(element: ElementVerdict) -> str:
-    """Return what decided on an element: the fields that are broken, else those that are not covered."""
     if element.reason:
         return element.reason
     fields = [field for field in element.fields if field.outcome == element.outcome]

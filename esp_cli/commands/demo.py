@@ -11,7 +11,7 @@ import typer
 from esp_cli import console
 from esp_cli.commands import options
 from esp_cli.commands.study_progress import StudyProgress
-from esp_cli.console.curves import draw_curves
+from esp_cli.console.progress import draw_curves
 from esp_cli.files.formatting import format_exactly
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def demo(
     Called again, it goes on where it was.
     """
     from esp_cli.commands import studying
-    from esp_cli.commands.stopping import stop_requests
+    from esp_cli.console.progress import stop_requests
     from esp_cli.studies.catalogue import refuse_untrainable
     from esp_cli.studies.engine import LocalEngine
     from esp_cli.studies.study import StudyFolder
@@ -62,7 +62,6 @@ def demo(
 
 
 def _plan(task: str, steps: int, seeds: tuple[int, ...], out: Path, settings: list[str]) -> Study:
-    """Return the study of the prior of one task, its runs called by what they differ in."""
     from esp_cli.studies.catalogue import Request, plan
     from esp_cli.training.config import seed_words
 
@@ -91,7 +90,6 @@ class LiveCurves(StudyProgress):
         self._folder, self._told = folder, 0
 
     def update(self, snapshot: Snapshot) -> None:
-        """Show where the runs are, and draw their curves."""
         super().update(snapshot)
         curves = {cell.variant: self._points(cell) for cell in self._folder.study.cells}
         if self._live is not None:
@@ -118,7 +116,6 @@ class LiveCurves(StudyProgress):
 
 
 def _show(folder: StudyFolder) -> None:
-    """Write the picture and the film, and print what was seen."""
     from esp_cli.commands.report import print_answer
     from esp_cli.drawing.draw import Request, draw
     from esp_cli.policies.loading import TrainedPolicy

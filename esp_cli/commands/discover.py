@@ -80,8 +80,8 @@ def _discovery(
     if task is not None and not path.is_dir():
         raise UserError(f"--task is for a run, or a file of transitions, and there is no {what}; leave it out")
     if path.is_dir():
-        from esp_cli.training.config_file import parse_config
         from esp_cli.training.run_folder import RunFolder
+        from esp_cli.training.settings import parse_config
 
         config = parse_config(RunFolder.open(path).config, path)
         name, settings = config.task, config.task_settings | settings

@@ -81,7 +81,6 @@ def export(
 
 
 def _check_options(formats: list[str], seed: int | None, episodes: int | None, name: str | None) -> None:
-    """Refuse unknown formats, and options that do not go together."""
     for unknown in set(formats) - set(FORMATS):
         raise UserError(f"there is no format '{unknown}'; the formats are {', '.join(FORMATS)}")
     bundles = "policy" in formats

@@ -25,8 +25,7 @@ EPILOG = """Examples:\n
     esp mirror robot.xml --check symmetry:compute_symmetric_states\n
     esp mirror robot.xml --numbers my_robot:numbers --policy policy.onnx"""
 
-_SHOWN = 4
-"""Elements that have a column in the table; the others are in the JSON."""
+_SHOWN = 4  # elements that have a column in the table; the others are in the JSON
 
 
 def mirror(

@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable, Iterable
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
 
@@ -93,7 +93,7 @@ def register_named(
 
     homes = {
         "esp_envs.registry:TASKS": tasks,
-        "esp_cli.algorithms.registry:ALGORITHMS": algorithms,
+        "esp_cli.algorithms.presets:ALGORITHMS": algorithms,
         "esp_cli.networks.build:NETWORKS": networks,
     }
     for home, names in homes.items():
@@ -147,32 +147,18 @@ def not_over_a_run(context: typer.Context, path: T) -> T:
 
 
 TaskOption = Annotated[str, typer.Option("--task", "-t", help="Task: one that `esp tasks` lists, or module:Class.")]
+_OWN: dict[str, Any] = {"parser": _own_class, "metavar": "MODULE:CLASS"}
 OwnTaskOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--task",
-        parser=_own_class,
-        help="Import this task of yours, which the run or policy is of.",
-        metavar="MODULE:CLASS",
-    ),
+    list[str] | None, typer.Option("--task", help="Import this task of yours, which the run or policy is of.", **_OWN)
 ]
 AlgoOption = Annotated[
     str, typer.Option("--algo", "-a", help="Learning algorithm: mappo, maddpg, qmix, or module:Class.")
 ]
 OwnAlgoOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--algo",
-        parser=_own_class,
-        help="Import this algorithm of yours, which trained the run.",
-        metavar="MODULE:CLASS",
-    ),
+    list[str] | None, typer.Option("--algo", help="Import this algorithm of yours, which trained the run.", **_OWN)
 ]
 OwnNetworkOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--network", parser=_own_class, help="Import this network of yours, which the run has.", metavar="MODULE:CLASS"
-    ),
+    list[str] | None, typer.Option("--network", help="Import this network of yours, which the run has.", **_OWN)
 ]
 PresetOption = Annotated[
     str,

@@ -41,7 +41,6 @@ def policies(
 
 
 def _print(entries: Sequence[Entry]) -> None:
-    """Print a table for each convention of returns, within which alone they compare."""
     groups: dict[tuple[str, int, str, int], list[Entry]] = {}
     for entry in entries:
         groups.setdefault((entry.task, entry.task_version, entry.convention, entry.score.episodes), []).append(entry)

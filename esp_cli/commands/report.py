@@ -123,7 +123,7 @@ def report(
 
 def print_answer(material: Material, full: bool) -> None:
     """Print what came out, on request below every table."""
-    from esp_cli.reporting.answer import answer
+    from esp_cli.reporting.page import answer
     from esp_cli.reporting.tables import all_tables
 
     with console.paged():
@@ -136,7 +136,6 @@ def print_answer(material: Material, full: bool) -> None:
 def _side_by_side(
     runs: Sequence[str], at: Sequence[str], thresholds: Sequence[float], mode: Mode | None, out: Path | None
 ) -> Material:
-    """Read runs that are given by hand, each as PATH or LABEL=PATH."""
     from esp_cli.reporting.collect import collect_runs, read_curve
 
     steps, curves = [parse_count(text) for text in at], []

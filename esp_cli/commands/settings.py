@@ -40,7 +40,6 @@ def settings(
 
 
 def _sections(of: str | None) -> Sequence[Section]:
-    """Return the sections that a name asks for."""
     from esp_cli.training.settings import own_section, sections, task_section
 
     if of is not None and ":" in of:
@@ -74,7 +73,6 @@ def _print_section(section: Section) -> None:
 
 
 def _meaning(setting: Setting) -> str:
-    """Return what a setting does, and what presets and tasks set it to instead."""
     told = "paper" if "paper:" in setting.description else None
     changed = {name: value for name, value in setting.presets.items() if name.split()[-1] != told}
     texts = [f"{name} {_written(value)}" for name, value in {**changed, **setting.tasks}.items()]
@@ -82,7 +80,6 @@ def _meaning(setting: Setting) -> str:
 
 
 def _written(value: object) -> str:
-    """Write a value as --set takes it."""
     if value is None:
         return "-"
     if isinstance(value, bool):

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 
 def _changed(annotation: Any, **changes: object) -> Any:
-    """Return an annotation whose option of typer has other attributes."""
     kind, option = get_args(annotation)
     option = copy.copy(option)
     vars(option).update(changes)
@@ -128,7 +127,6 @@ class StudyChoices:
     words: Sequence[str] = field(init=False, default=())  # the command without these options: "reproduce", "table1"
 
     def folder(self, kind: str) -> Path:
-        """Return the study folder of a kind of study."""
         return self.out or Path("runs") / kind
 
     def running_words(self) -> str:
@@ -141,7 +139,6 @@ class StudyChoices:
         return _words({name: shared[name] for name in names}, vars(self))
 
     def request(self, kind: str) -> Request:
-        """Return what a study of a kind is asked for."""
         from esp_cli.machine import resolve_device
         from esp_cli.studies.catalogue import Request
 
@@ -163,7 +160,6 @@ class StudyChoices:
 
 
 def _words(parameters: Mapping[str, inspect.Parameter], values: Mapping[str, Any]) -> list[str]:
-    """Return the parameters of a command that are not at their defaults, as its command line has them."""
     from esp_cli.training.config import seed_words
 
     words = list[str]()

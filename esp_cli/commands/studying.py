@@ -15,9 +15,9 @@ import typer
 
 from esp_cli import console
 from esp_cli.commands.options import note_without_effect
-from esp_cli.commands.stopping import stop_requests
 from esp_cli.commands.study_options import StudyChoices
 from esp_cli.commands.study_progress import StudyProgress
+from esp_cli.console.progress import stop_requests
 from esp_cli.machine import busy_with
 from esp_cli.training.folder_names import LOG
 from esp_envs.errors import UserError
@@ -76,11 +76,7 @@ def run_or_forecast(kind: str, request: Request, choices: StudyChoices) -> None:
 def run_study(
     kind: str, request: Request, choices: StudyChoices, mode: Mode | None = None, thresholds: Sequence[float] = ()
 ) -> None:
-    """Plan a study, run it, and report it.
-
-    The tables state evaluations of the mode, and thresholds whose first passing is looked for: by default those of this
-    kind of study.
-    """
+    """Plan a study, run it, and report it, by default with the mode and the thresholds of its kind."""
     from esp_cli.studies.catalogue import plan, refuse_untrainable, without_effect
     from esp_cli.studies.study import StudyFolder
 

@@ -13,7 +13,7 @@ import typer
 from esp_cli import console
 from esp_cli.commands import options
 from esp_cli.commands.counts import chosen_seeds
-from esp_cli.commands.stopping import stop_requests
+from esp_cli.console.progress import stop_requests
 from esp_cli.defaults import STEPS, PriorKind
 from esp_cli.networks.kernels.library import begin
 from esp_envs.errors import UserError
@@ -150,7 +150,6 @@ def _refuse_beside_resume(context: typer.Context, allowed: Sequence[str]) -> Non
 
 
 def _train(run: Run, trackers: Sequence[str], check: bool) -> None:
-    """Train until the end or an interrupt, then print the result and the next command."""
     with run.trainer(trackers, check) as trainer, stop_requests("stopping after this iteration") as requests:
         if trainer.is_complete and run.is_complete:
             console.note(f"{run.path} is complete at {console.format_count(trainer.step)} steps")
@@ -203,7 +202,6 @@ def _announce(config: RunConfig, path: Path, step: int) -> None:
 
 
 def _shown(news: Progress) -> dict[str, float]:
-    """Return the numbers of the progress line: means over the seeds that still train."""
     names = {"greedy": "eval/return_greedy", "return": "train/return", "entropy": "train/entropy"}
     out = {}
     for label, name in names.items():

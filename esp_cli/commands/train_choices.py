@@ -24,17 +24,7 @@ _PARAMETERS = {"algorithm": "algo"}  # names of parameters that differ from thos
 def plan_run(
     context: typer.Context, file: Path | None, choices: dict[str, Any], settings: dict[str, object]
 ) -> tuple[RunConfig, Mapping[str, Tensor] | None, set[str]]:
-    """Resolve what was asked for into a configuration; nothing is written.
-
-    Args:
-        context: of the command, which knows what was given.
-        file: fills in what the command line leaves open.
-        choices: by their name in a file, defaults included.
-        settings: of the command line.
-
-    Returns:
-        The configuration, the weights that the run starts from, and the chosen settings that have no effect.
-    """
+    """Return the configuration asked for, the weights that it starts from, and chosen settings that have no effect."""
     from esp_cli.machine import resolve_device
     from esp_cli.run import plan
     from esp_cli.training.config import resolve_config
@@ -52,9 +42,8 @@ def plan_run(
 def _with_file(
     context: typer.Context, path: Path, given: dict[str, Any], settings: dict[str, object]
 ) -> tuple[dict[str, Any], dict[str, object], set[str]]:
-    """Let a file fill in what the command line leaves open."""
     from esp_cli.prior.config import SAID_BY_AUTO
-    from esp_cli.training.config_file import read_config_file
+    from esp_cli.training.settings import read_config_file
 
     file = read_config_file(path)
     named = {name for name in given if was_given(context, _PARAMETERS.get(name, name))}
@@ -80,10 +69,7 @@ def _with_file(
 
 
 def _fitting(kept: Mapping[str, object], settings: Mapping[str, object]) -> dict[str, object]:
-    """Return the settings of a whole run without those that another network or another task of the user's makes void.
-
-    What was measured or found in a task does not hold in a changed one, so it is measured and looked for again.
-    """
+    """Return the settings of a whole run without those that the user's other network or task makes void."""
     left = dict(kept)
     if "network.name" in settings:
         from esp_cli.networks.build import network_class
@@ -117,7 +103,6 @@ def _start_of(path: Path, config: RunConfig, source: str) -> Start:
 
 
 def _read(path: Path, name: str, value: Any) -> Any:
-    """Return a choice of a file in the form that its option has."""
     try:
         if name == "steps" and type(value) in (int, str):
             return parse_count(value)

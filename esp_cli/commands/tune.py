@@ -12,8 +12,8 @@ import typer
 from esp_cli import console
 from esp_cli.commands import studying
 from esp_cli.commands.options import check_finite, note_without_effect
-from esp_cli.commands.stopping import stop_requests
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
+from esp_cli.console.progress import stop_requests
 from esp_envs.errors import UserError
 from esp_envs.installed import install
 
@@ -68,8 +68,7 @@ def tune(
 
 
 def _tuning(request: Request, priors: Sequence[str], space: Path | None, trial_seeds: int, **goal: Any) -> Tuning:
-    """Return what is asked for; one task and one algorithm."""
-    from esp_cli.algorithms.registry import ALGORITHMS
+    from esp_cli.algorithms.presets import ALGORITHMS
     from esp_cli.studies.catalogue import task_setting
     from esp_cli.studies.tuning import NAMES, Tuning
     from esp_cli.studies.tuning_space import default_space, read_space
@@ -104,7 +103,6 @@ def _tuning(request: Request, priors: Sequence[str], space: Path | None, trial_s
 
 
 def _forecast(tuning: Tuning, request: Request, choices: StudyChoices) -> None:
-    """Say what a search costs."""
     from esp_cli.studies.forecast import forecast_search
 
     out = choices.folder("tune")
@@ -118,7 +116,6 @@ def _forecast(tuning: Tuning, request: Request, choices: StudyChoices) -> None:
 
 
 def _tune(tuning: Tuning, request: Request, choices: StudyChoices) -> None:
-    """Search, then judge the best settings; report both."""
     try:
         from esp_cli.studies.search import Search
     except ImportError:
@@ -157,7 +154,6 @@ def _tune(tuning: Tuning, request: Request, choices: StudyChoices) -> None:
 
 
 def _report(search: Search, outcomes: Sequence[Outcome], quiet: bool) -> None:
-    """Write the page of the search and say what to do next; print what it found, unless standard output is for JSON."""
     from esp_cli.reporting.tuning_page import budget_table, settings_table, write_page
 
     if not quiet:

@@ -74,7 +74,6 @@ def lay_out(columns: Sequence[str], rows: Sequence[Sequence[str]], console: Cons
 
 
 def _blocks(headings: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> list[Text]:
-    """Return every row as a name with a line per cell below it."""
     lines, label = [], max(map(len, headings[1:]), default=0)
     for name, *cells in rows:
         lines.append(Text(name, style="bold"))
@@ -113,7 +112,6 @@ def write_json(path: str | Path, value: object) -> None:
 
 
 def _plain(value: object) -> object:
-    """Turn a value into dicts, lists, numbers, texts and None."""
     if value is None or isinstance(value, bool | int | str):
         return value
     if isinstance(value, float):

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+import signal
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from types import FrameType
 
+import numpy as np
 from rich.console import RenderableType
 from rich.progress import Progress, ProgressColumn, Task
 from rich.text import Text
@@ -21,10 +24,7 @@ _WIDEST_BAR = 40
 
 
 def progress_line(description: str, share: float, status: Sequence[str], width: int) -> str:
-    """Return a line of at most `width` characters; what matters least goes first.
-
-    The first two items of the status stay; then come description, bar (the share that is done) and the other items.
-    """
+    """Return a line of at most `width` characters; what matters least goes first."""
     shown = "  ".join(status[:2])
     head = f"{description} " if len(description) + 1 + len(shown) <= width else ""
     for item in status[2:]:
@@ -43,7 +43,6 @@ class LineColumn(ProgressColumn):
     max_refresh = None
 
     def render(self, task: Task) -> Text:
-        """Return the line."""
         share = task.completed / task.total if task.total else 1.0
         width = err.width - 1
         return Text(progress_line(task.description, share, task.fields["status"], width), no_wrap=True, overflow="crop")
@@ -56,7 +55,6 @@ class LiveProgress(Progress):
     """What is shown above the lines."""
 
     def get_renderables(self) -> Iterable[RenderableType]:
-        """Yield what is drawn."""
         yield self.above
         yield from super().get_renderables()
 
@@ -164,3 +162,60 @@ def watching(description: str, unit: str) -> Iterator[Callable[..., None]]:
             bars[-1].update(done)
 
         yield watch
+
+
+MARKS, _STYLES = ("○", "●"), ("dodger_blue2", "dark_orange")  # of the curves in turn
+_HEIGHT, _WIDEST, _LABEL = 12, 64, 8  # rows and columns of the drawing, columns of a number beside it
+
+
+def draw_curves(curves: Mapping[str, Sequence[tuple[float, float]]], steps: int, width: int) -> Text:
+    """Draw two curves, name -> points (step, value), in one pair of axes, with extremes and legend."""
+    columns = max(10, min(_WIDEST, width - _LABEL - 2))
+    values = [value for points in curves.values() for _, value in points]
+    low, high = (min(values), max(values)) if values else (0.0, 0.0)
+    grid = np.full((_HEIGHT, columns), -1)
+    for index, points in enumerate(curves.values()):
+        if points:
+            at, means = np.array(points).T
+            shown = np.arange(columns) * steps / (columns - 1)
+            shown = shown[(shown >= at[0]) & (shown <= max(at[-1], steps / columns))]
+            share = (np.interp(shown, at, means) - low) / max(high - low, 1e-9)
+            rows = np.round((1 - share) * (_HEIGHT - 1)).astype(int)
+            grid[rows, np.round(shown / steps * (columns - 1)).astype(int)] = index
+    text = Text()
+    for number, row in enumerate(grid):
+        level = {0: high, _HEIGHT - 1: low}.get(number) if values else None
+        text.append(f"{'' if level is None else f'{level:.4g}':>{_LABEL}} │")
+        for index in row:
+            text.append(" " if index < 0 else MARKS[index], "" if index < 0 else _STYLES[index])
+        text.append("\n")
+    text.append(f"{'':{_LABEL}} └{'─' * columns}\n{'':{_LABEL}}  0{format_count(steps) + ' steps':>{columns - 1}}\n")
+    for index, (name, points) in enumerate(curves.items()):
+        newest = f" {points[-1][1]:.1f}" if points else ""
+        text.append(f"{'':{_LABEL}}  {MARKS[index]} {name}{newest}", _STYLES[index])
+    return text.append("\n")
+
+
+@contextmanager
+def stop_requests(sentence: str) -> Iterator[list[int]]:
+    """Turn the first Ctrl-C (or SIGTERM, or the SIGHUP of a closed terminal) into a request; a second one interrupts.
+
+    A SIGHUP that `nohup` ignores stays ignored. The list that is yielded is empty until the request comes, which is
+    answered with the sentence.
+    """
+    requests: list[int] = []
+
+    def handler(number: int, _frame: FrameType | None) -> None:
+        if requests:
+            raise KeyboardInterrupt
+        requests.append(number)
+        note(f"{sentence} (press Ctrl-C again to stop at once)")
+
+    heard = [signal.SIGINT, signal.SIGTERM]
+    heard += [signal.SIGHUP] if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN else []
+    previous = {number: signal.signal(number, handler) for number in heard}
+    try:
+        yield requests
+    finally:
+        for number, old in previous.items():
+            signal.signal(number, old)

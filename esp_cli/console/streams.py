@@ -69,7 +69,6 @@ class _StandardError:
         return len(text)
 
     def flush(self) -> None:
-        """Flush what was written, or say no more."""
         self._attempt(self._stream.flush)
 
     def _attempt(self, action: Callable[..., object], *arguments: str) -> None:
@@ -92,7 +91,6 @@ def fit_encoding() -> None:
 
 
 def _in_ascii(error: UnicodeError) -> tuple[str, int]:
-    """Return what stands for characters that cannot be encoded, and where to go on."""
     assert isinstance(error, UnicodeEncodeError)
     return "".join(_IN_ASCII.get(character, "?") for character in error.object[error.start : error.end]), error.end
 

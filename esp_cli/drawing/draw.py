@@ -60,12 +60,10 @@ class Request:
 
     @property
     def kind(self) -> str:
-        """The ending of the file."""
         return self.out.suffix.lower()
 
     @property
     def rate(self) -> float:
-        """Most frames per second."""
         rate = self.fps or FRAMES_PER_SECOND
         return min(rate, GIF_FRAMES_PER_SECOND) if self.kind == ".gif" else rate
 
@@ -87,17 +85,7 @@ def draw(
     names: Sequence[str] = (),
     watch: Callable[[int, int], None] | None = None,
 ) -> Drawing:
-    """Play episodes of one seed's policy and draw them off-screen, alone or beside those of another policy.
-
-    Args:
-        request: what is drawn, and into which file.
-        policies: one run, or two of the same task that play the same episodes.
-        names: of the policies, where there are two.
-        watch: called with the numbers of drawn and of all frames.
-
-    Raises:
-        UserError: no such seed, a view that cannot be drawn, or policies that cannot be compared.
-    """
+    """Play episodes of one seed's policy and draw them off-screen, alone or beside those of another policy."""
     acting, spec = _acting(request, policies), policies[0].spec
     titles = names if len(policies) > 1 else [None]
     env = build_environment(acting[0].config, 1, "film")
@@ -124,7 +112,6 @@ def draw(
 
 
 def _acting(request: Request, policies: Sequence[TrainedPolicy]) -> list[TrainedPolicy]:
-    """Return the policies that act, of one seed each."""
     first, *others = policies
     for other in others:
         if other.config.task != first.config.task:
@@ -168,7 +155,6 @@ class Shot:
     steps: int  # how many it stays in view
 
     def draw(self, painter: Painter) -> Frame:
-        """Draw the moments with caption, axes and legend."""
         return frame(painter, self.moments, self.caption, self.time_s)
 
 
@@ -179,15 +165,7 @@ def shots(
     title: str,
     names: Sequence[str | None] = (None,),
 ) -> list[Shot]:
-    """Choose every so-many-th scene of each episode, its first and its last among them.
-
-    Args:
-        recorded: episodes of each policy that is shown; the one that ends first waits for the other.
-        every: steps from one frame to the next.
-        period_s: of a step, s.
-        title: the task.
-        names: of the policies.
-    """
+    """Choose every so-many-th scene of each episode, its first and its last among them."""
     chosen = []
     for k, together in enumerate(zip(*recorded, strict=True), start=1):
         caption = f"{title}, episode {k} of {len(recorded[0])}"
@@ -202,10 +180,7 @@ def shots(
 def write_film(
     path: Path, painter: Painter, taken: Sequence[Shot], step_s: float, watch: Callable[[int], None]
 ) -> None:
-    """Draw shots in their order and write them as an MP4 where the file is named so, else as a GIF.
-
-    A step is in view for `step_s` seconds, the last of an episode longer; `watch` is told how many frames are drawn.
-    """
+    """Draw shots in their order and write them as an MP4 where the file is named so, else as a GIF."""
     ends = [*(after.time_s == 0 for after in taken[1:]), True]
     seconds = [shot.steps * step_s + HOLD_SECONDS * end for shot, end in zip(taken, ends, strict=True)]
     usual = taken[0].steps * step_s

@@ -27,11 +27,7 @@ _MARKERS = {"disc": "o", "ring": "o", "square": "s", "cross": "x"}
 
 
 def summary(episode: Episode, title: str, size: int, period_s: float) -> Frame:
-    """Draw an episode, whose steps take `period_s` seconds, as one picture that is `size` pixels wide.
-
-    Bodies that want to be covered get a map of their coverage; bodies without paths get a strip of their last steps;
-    everything else gets its paths.
-    """
+    """Draw an episode, whose steps take `period_s` seconds, as one picture that is `size` pixels wide."""
     last = episode.scenes[-1]
     title = f"{title}, return {episode.returns[-1]:.1f}"
     if any(body.reach is not None for body in last.bodies):
@@ -127,7 +123,6 @@ def _title(axes: Axes, title: str) -> None:
 
 
 def _axes(axes: Axes, scene: Scene) -> Axes:
-    """Give axes the window, the grid and the unit of a scene."""
     x_min, x_max, y_min, y_max = scene.window
     unit = f" ({scene.unit})" if scene.unit else ""
     axes.set(xlim=(x_min, x_max), ylim=(y_min, y_max), xlabel=f"x{unit}", ylabel=f"y{unit}", aspect="equal")
@@ -142,7 +137,6 @@ def _axes(axes: Axes, scene: Scene) -> Axes:
 
 
 def _add_paths(axes: Axes, episode: Episode) -> None:
-    """Add every body as it is at the end, and the paths of those that leave one."""
     last = episode.scenes[-1]
     for body in last.bodies:
         _add_body(axes, body)
@@ -155,7 +149,6 @@ def _add_paths(axes: Axes, episode: Episode) -> None:
 
 
 def _add_legend(figure: Figure, scene: Scene, *, started: bool) -> None:
-    """Say below the figure what its marks mean."""
     entries = [_entry(mark) for mark in marks(scene)]
     if started:
         entries.append(Line2D([], [], ls="", label="start", marker="o", color="#606060", mec="white", ms=7))
@@ -163,7 +156,6 @@ def _add_legend(figure: Figure, scene: Scene, *, started: bool) -> None:
 
 
 def _entry(mark: Mark) -> Line2D:
-    """Return a mark as matplotlib draws it; two colours share a disc."""
     first, second = mark.colors[0], mark.colors[-1]
     entry = Line2D([], [], ls="", marker=_MARKERS.get(mark.shape, "o"), color=first, ms=8, label=mark.label)
     if mark.shape == "disc" and second != first:

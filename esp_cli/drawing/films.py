@@ -90,14 +90,7 @@ def beside(pictures: Sequence[Frame], gap: int) -> Frame:
 
 
 def write_gif(path: Path, frames: Iterable[Frame], seconds: Sequence[float], sample: Sequence[Frame]) -> None:
-    """Write frames as an endlessly repeated GIF.
-
-    Args:
-        path: where to.
-        frames: [H, W, 3] each, all of one size; taken one after the other, so they need not all be in memory.
-        seconds: how long each frame is in view.
-        sample: some of the frames, which the one palette of the film is made for.
-    """
+    """Write frames [H, W, 3] of one size, each in view for some seconds, as an endless GIF in `sample`'s colours."""
     palette = _palette(sample)
     reduced = _reduced(frames, palette)
     content = BytesIO()
@@ -150,7 +143,6 @@ def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
 
 
 def _bar(width: int, size: int, left: str, right: str) -> Frame:
-    """Draw a line of text with its ends at both sides."""
     image = Image.new("RGB", (width, round(_BAR * size)), _PAPER)
     draw, middle = ImageDraw.Draw(image), image.height / 2
     draw.text((size / 2, middle), left, _TEXT, _font(size), anchor="lm")
@@ -160,7 +152,6 @@ def _bar(width: int, size: int, left: str, right: str) -> Frame:
 
 @lru_cache(maxsize=8)
 def _legend(entries: tuple[Mark, ...], width: int, size: int, note: str) -> Frame:
-    """Draw marks with their labels, and a note at the right."""
     fine = size * _OVERSAMPLING
     image = Image.new("RGB", (width * _OVERSAMPLING, round(_BAR * size) * _OVERSAMPLING), _PAPER)
     draw, font = ImageDraw.Draw(image), _font(fine)
@@ -208,7 +199,6 @@ def _with_axes(picture: Frame, scene: Scene, size: int) -> Frame:
 
 
 def _ticks(low: float, high: float, spacing: float, scale: float, size: int) -> list[float]:
-    """Return multiples of the spacing in a range, as dense as numbers fit."""
     step = spacing
     while step * scale < 3 * size:
         step *= 2
@@ -228,10 +218,7 @@ def _milliseconds(seconds: Sequence[float]) -> list[int]:
 
 
 def _palette(sample: Sequence[Frame]) -> Frame:
-    """Return up to 255 colours for some frames: the most frequent as they are, the others by how they differ.
-
-    A small robot has few pixels, so the others count once each, however many pixels they have.
-    """
+    """Return up to 255 colours for some frames: the most frequent as they are, the others by how they differ."""
     codes, counts = np.unique(np.concatenate([_codes(frame).ravel() for frame in sample]), return_counts=True)
     colors = _colors(codes[np.argsort(-counts, kind="stable")])
     frequent, others = colors[:_EXACT_COLORS], colors[_EXACT_COLORS:]
@@ -256,11 +243,9 @@ def _reduced(frames: Iterable[Frame], palette: Frame) -> Iterator[Image.Image]:
 
 
 def _codes(frame: Frame) -> NDArray[np.uint32]:
-    """Return one number per pixel."""
     red, green, blue = np.moveaxis(frame.astype(np.uint32), -1, 0)
     return red << 16 | green << 8 | blue
 
 
 def _colors(codes: NDArray[np.uint32]) -> Frame:
-    """Return [K, 3] the colours behind numbers [K]."""
     return np.stack([codes >> 16, codes >> 8 & 255, codes & 255], -1).astype(np.uint8)

@@ -8,9 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from esp_cli.policies.loading import TrainedPolicy
-from esp_cli.training.build import build_environment
-from esp_cli.training.play import PolicyController
-from esp_cli.training.streams import generators
+from esp_cli.training.build import PolicyController, build_environment, generators
 from esp_envs.base import Environment, put_back
 from esp_envs.errors import UserError
 from esp_envs.scene import Scene
@@ -30,7 +28,6 @@ class Moment:
 
     @property
     def scene(self) -> Scene:
-        """The scene now."""
         return self.scenes[-1]
 
 
@@ -43,7 +40,6 @@ class Episode:
 
     @property
     def steps(self) -> int:
-        """Steps from the start to the end."""
         return len(self.scenes) - 1
 
     def moment(self, step: int, name: str | None = None) -> Moment:
@@ -53,16 +49,7 @@ class Episode:
 
 
 def record(policies: Sequence[TrainedPolicy], episodes: int | None = None, greedy: bool = True) -> list[list[Episode]]:
-    """Play the same episodes, one after the other, with each policy.
-
-    Args:
-        policies: of one task and one seed each; the first one's seed decides how episodes begin.
-        episodes: how many; by default as many as last about `FILM_SECONDS`, at least one.
-        greedy: act greedily, or draw actions.
-
-    Raises:
-        UserError: episodes do not begin alike, since the policies' tasks have other settings.
-    """
+    """Play the same episodes with each policy, of one task and one seed each, by default about `FILM_SECONDS` long."""
     seeds, recorded = policies[0].config.seeds, list[list[Episode]]()
     for trained in policies:
         env = build_environment(trained.config.model_copy(update={"seeds": seeds}), 1, "film")
@@ -83,7 +70,6 @@ def record(policies: Sequence[TrainedPolicy], episodes: int | None = None, greed
 
 
 def _long_enough(recorded: Sequence[Episode], period_s: float) -> bool:
-    """Return whether the film would come nearer to its length without one more episode."""
     if not recorded:
         return False
     seconds = sum(episode.steps * period_s + HOLD_SECONDS for episode in recorded)

@@ -1,6 +1,6 @@
 """A program as C99: float32, no allocation, no library but libm; weights in constant arrays, scratch in static ones.
 
-The functions of the layers are in runtime/layers.c, of which a source has those that it calls.
+The functions of the layers are in layers.c, of which a source has those that it calls.
 """
 
 from __future__ import annotations
@@ -40,11 +40,7 @@ def cost(program: Program) -> Cost:
 
 
 def c_source(program: Program, comment: str) -> dict[str, bytes]:
-    """Write a program as a source and a header that begins with a comment.
-
-    Raises:
-        UserError: agents that exchange messages and have continuous actions.
-    """
+    """Write a program as a source and a header that begins with a comment."""
     if program.team > 1 and program.head != "choose":
         raise UserError(
             "C export of agents that exchange messages supports discrete actions only; use onnx, torch or numpy"
@@ -97,7 +93,6 @@ def _row_width(program: Program) -> int:
 
 
 def _signature(program: Program) -> str:
-    """Return the declaration of the function that acts, without a semicolon."""
     agents = "ESP_POLICY_AGENTS * " if program.team > 1 else ""
     parameters = [f"const float observation[{agents}ESP_POLICY_OBSERVATION]"]
     parameters += [f"const unsigned char allowed[{agents}ESP_POLICY_ACTION]"] if program.masked else []
@@ -119,7 +114,6 @@ def _functions(code: str) -> list[str]:
 
 
 def _body(program: Program) -> str:
-    """Write the statements of the function that acts."""
     lines = ["EACH memcpy(X, observation + i * ESP_POLICY_OBSERVATION, sizeof(float) * ESP_POLICY_OBSERVATION);"]
     if program.previous:
         copied = f"memory + {program.hidden}, sizeof(float) * {program.previous}"
@@ -151,11 +145,7 @@ def compiler() -> str | None:
 
 
 def compiled(*files: Path) -> ctypes.CDLL:
-    """Compile written C sources into a library beside the first, with every warning an error.
-
-    Raises:
-        RuntimeError: they do not compile, which is a bug.
-    """
+    """Compile written C sources into a library beside the first, with every warning an error."""
     shared = files[0].with_suffix(".so")
     command = [compiler() or "cc", *FLAGS, "-shared", "-fPIC", *map(str, files), "-o", str(shared), "-lm"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)

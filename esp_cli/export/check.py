@@ -60,10 +60,7 @@ class Agreement:
 
 @torch.no_grad()
 def take_sample(trained: TrainedPolicy, program: Program, count: int = OBSERVATIONS) -> Sample:
-    """Let one seed's policy act: one half on observations that it meets in its task, one half on random ones.
-
-    Worlds of a team stay whole, so there may be a few observations more.
-    """
+    """Let one seed's policy act: one half on observations that it meets in its task, one half on random ones."""
     obs, memory, mask = _play(trained, _whole(count // 2, program.team))
     missing = _whole(count - len(obs), program.team)
     rng = np.random.default_rng(0)

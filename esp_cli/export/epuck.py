@@ -18,8 +18,8 @@ import torch
 
 from esp_cli.defaults import __version__
 from esp_cli.export.c_file import compiled, numbers
+from esp_cli.export.esp_epuck import FIELDS, PATIENCE_S, Pilot
 from esp_cli.export.layers import Floats, literal
-from esp_cli.export.runtime.esp_epuck import FIELDS, PATIENCE_S, Pilot
 from esp_cli.export.templates import RUNTIME, filled
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training.build import build_environment
@@ -50,11 +50,7 @@ def seen_robots(settings: Mapping[str, Any]) -> int:
 
 
 def c_files(description: Mapping[str, Any]) -> dict[str, bytes]:
-    """Return header and source that build observations from poses and drive the wheels, by a policy without memory.
-
-    Raises:
-        UserError: the policy sees something that poses do not tell.
-    """
+    """Return header and source that build observations from poses and drive the wheels, by a policy without memory."""
     robot, settings = description["robot"], description["task"]["settings"]
     fields = [(field["field"], field["index"].partition("..")[0]) for field in description["observation"]]
     names, nearness = {name for name, _ in fields}, settings["sight"] == "nearness"
@@ -154,11 +150,7 @@ def _probe(env: Environment, state: Floats, rng: np.random.Generator, near: bool
 
 
 def compare_scenes(scenes: Scenes, observe: Observer) -> float:
-    """Return the largest difference between the task's observations and those built from poses.
-
-    Raises:
-        RuntimeError: they do not agree, which is a bug.
-    """
+    """Return the largest difference between the task's observations and those built from poses."""
     built = [observe(*state) for state in zip(scenes.poses, scenes.goals, scenes.pillars, strict=True)]
     gap = float(np.abs(np.stack(built) - scenes.observations).max())
     if not gap <= TOLERANCE:
@@ -172,11 +164,7 @@ def python_observer(description: Mapping[str, Any]) -> Observer:
 
 
 def c_observer(folder: Path, width: int) -> Observer:
-    """Compile esp_epuck.c and policy.c, and return what they do, robot by robot.
-
-    Raises:
-        RuntimeError: it does not compile, or refuses a state; either is a bug.
-    """
+    """Compile esp_epuck.c and policy.c, and return what they do, robot by robot."""
     code = compiled(folder / "esp_epuck.c", folder / "policy.c")
 
     def observe(poses: Floats, goals: Floats, pillars: Floats) -> Floats:

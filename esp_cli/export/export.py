@@ -97,7 +97,6 @@ def _numpy(job: Job) -> Files:
 
 
 def _robot(job: Job, kind: str) -> Files:
-    """Return the numpy policy with what a robot's program needs around it."""
     spec = job.trained.spec
     prior = job.trained.config.prior.effective()
     if compass := prior.compass:
@@ -148,14 +147,7 @@ FORMATS = {
 
 
 def export(trained: TrainedPolicy, formats: Sequence[str], folder: Path, force: bool = False) -> Exported:
-    """Write one seed's policy in some formats, with `policy.json` and a README, after checking each.
-
-    `formats` are names of `FORMATS`; `force` replaces files of an earlier export.
-
-    Raises:
-        UserError: a file exists already, an earlier export has formats that are not written anew, a library is
-            missing, or the format does not support the policy.
-    """
+    """Write one seed's policy in some formats, with `policy.json` and a README, after checking each."""
     formats = tuple(dict.fromkeys(formats))
     if force:
         _refuse_mixture(formats, folder)

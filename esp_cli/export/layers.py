@@ -1,6 +1,6 @@
 """The kinds of layers that exports know, each with its form in C, ONNX and torch.
 
-A kind is a function here, an entry of `LAYERS` in `runtime/numpy_policy.py` and a function of `runtime/layers.c`.
+A kind is a function here, an entry of `LAYERS` in `numpy_policy.py` and a function of `layers.c`.
 """
 
 from __future__ import annotations
@@ -142,10 +142,7 @@ def cut(begin: int, end: int) -> Layer:
 
 
 def convolution(weight: Floats, bias: Floats, shape: tuple[int, int, int], side: int, stride: int) -> Layer:
-    """Return a filter at every `stride`-th place of pictures of a shape (channels, rows, columns).
-
-    The weight is [channels * side * side, outputs], counted by channel, then row, then column.
-    """
+    """Return a filter at every `stride`-th place of pictures of a shape (channels, rows, columns)."""
     (channels, rows, columns), outputs = shape, bias.size
     _, high, wide = convolved(shape, outputs, side, stride)
     filters = (outputs, channels, side, side)

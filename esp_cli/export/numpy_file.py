@@ -10,10 +10,10 @@ from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
 
+from esp_cli.export import numpy_policy
 from esp_cli.export.check import Numbers, Runner
 from esp_cli.export.layers import Floats
 from esp_cli.export.program import Program
-from esp_cli.export.runtime import numpy_policy
 from esp_cli.export.templates import filled
 
 

@@ -42,11 +42,7 @@ _SQUASH = f"""
 
 
 def library(name: str) -> Any:
-    """Import onnx or onnxruntime; the latter reports nothing to its makers.
-
-    Raises:
-        UserError: it is not installed.
-    """
+    """Import onnx or onnxruntime; the latter reports nothing to its makers."""
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # else it writes to the home folder too
     try:
         return import_module(name)
@@ -62,9 +58,6 @@ def onnx_model(program: Program, description: str) -> bytes:
     `memory_out` [rows, H]. A team's rows stand side by side, world after world.
 
     The description, which is JSON, goes into the model's metadata.
-
-    Raises:
-        UserError: onnx is not installed.
     """
     onnx, graph = library("onnx"), _Graph()
     choose, row = program.head == "choose", f"float[rows, {program.num_outputs}]"
@@ -125,7 +118,6 @@ class _Graph:
             self.lines.append(f"{start}({', '.join(map(self._named, arguments.split(', ')))})")
 
     def add_layer(self, k: int, layer: Layer, x: str) -> str:
-        """Add what layer k makes of x, and return its name."""
         arrays = layer.onnx_arrays or layer.arrays
         self.constants |= {f"w{i}_{k}": array for i, array in enumerate(arrays)}
         names = [name for line in layer.onnx.splitlines() for name in line.partition(" = ")[0].strip().split(", ")]
@@ -134,7 +126,6 @@ class _Graph:
         return f"y_{k}"
 
     def _named(self, argument: str) -> str:
-        """Return the name of an argument, which may be a number."""
         try:
             value = json.loads(argument)
         except json.JSONDecodeError:

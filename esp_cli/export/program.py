@@ -29,7 +29,7 @@ from esp_cli.networks.layers import SeedLayerNorm, SeedLinear, SeedMLP
 from esp_cli.networks.message_passing import REACH_SQUARED, MessagePassing, PictureEncoder
 from esp_cli.networks.plain import GRU, MLP
 from esp_cli.networks.policy import HistoryPolicy, Policy
-from esp_cli.networks.separate import Separate
+from esp_cli.networks.symmetrised import Separate
 from esp_envs.errors import UserError
 
 SQUASH_EPSILON = 1e-18  # squashing adds this to the squared length (`esp_cli.networks.heads.squash`)
@@ -61,12 +61,10 @@ class Program:
 
     @property
     def num_parameters(self) -> int:
-        """Learned numbers."""
         return len(self.weights) // 4
 
     @property
     def flops(self) -> int:
-        """Operations for one action."""
         own = self.num_outputs if self.head == "choose" else 5 * self.num_outputs
         return sum(layer.flops for layer in self.layers) + own
 
@@ -76,11 +74,7 @@ class Program:
 
 
 def program_of(policy: Policy, masked: bool = False) -> Program:
-    """Return the program of a policy with a single seed, of a task with masks of allowed actions or without.
-
-    Raises:
-        UserError: a network or head that exports do not know.
-    """
+    """Return the program of a policy with a single seed, of a task with masks of allowed actions or without."""
     actor, head = policy.actor, policy.head
     sums: list[Layer] = []
     if isinstance(actor, Separate):  # the sums of an action's parts are one more layer
@@ -112,7 +106,6 @@ def program_of(policy: Policy, masked: bool = False) -> Program:
 
 
 def _network(actor: Network) -> list[Layer]:
-    """Return the layers of a network."""
     if isinstance(actor, MLP):
         return _perceptron(actor)
     if isinstance(actor, GRU):
@@ -131,7 +124,6 @@ def _network(actor: Network) -> list[Layer]:
 
 
 def _message_passing(actor: MessagePassing) -> list[Layer]:
-    """Return the layers of a team: the pictures, then message passing."""
     own = [layers.cut(actor.picture.start, actor.picture.stop), *_pictures(actor.encoder)]
     for layer in actor.layers:
         inputs = len(_arrays(layer)[0])
@@ -152,7 +144,6 @@ def _pictures(encoder: PictureEncoder) -> list[Layer]:
 
 
 def _perceptron(mlp: SeedMLP) -> list[Layer]:
-    """Return the layers in the order in which `SeedMLP` applies them."""
     norms = [] if mlp.norms is None else [_norm(norm) for norm in mlp.norms]
     own: list[Layer] = [*norms[:1]]
     last = len(mlp.layers) - 1
@@ -165,7 +156,6 @@ def _perceptron(mlp: SeedMLP) -> list[Layer]:
 
 
 def _activated(linear: object, name: str) -> list[Layer]:
-    """Return a linear layer and the activation after it."""
     weight, bias = _arrays(linear)
     return [layers.affine(weight, bias), layers.activation("relu" if name == "relu" else "tanh", bias.size)]
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-RUNTIME = Path(__file__).parent / "runtime"
+RUNTIME = Path(__file__).parent  # of the files that exports bring along as they are
 _TEMPLATES = Environment(
-    loader=FileSystemLoader(Path(__file__).parent / "templates"),
+    loader=FileSystemLoader(RUNTIME / "templates"),
     undefined=StrictUndefined,
     trim_blocks=True,
     keep_trailing_newline=True,

@@ -34,7 +34,6 @@ class TorchProgram(nn.Module):
     def forward(
         self, observation: Tensor, memory: Tensor | None = None, action_mask: Tensor | None = None
     ) -> tuple[Tensor, ...]:
-        """Act."""
         program, x = self.program, observation
         hidden = x[:, :0] if memory is None else memory[:, : program.hidden]
         if program.previous and memory is not None:
@@ -61,10 +60,7 @@ def _squash(x: Tensor, groups: tuple[int, ...]) -> Tensor:
 
 
 def torch_archive(program: Program, description: str) -> bytes:
-    """Write a program as an archive of torch.export, for any number of rows, or of worlds for a team.
-
-    The description, which is JSON, goes into the archive as `policy.json`.
-    """
+    """Write a program as an archive of torch.export, for any number of rows, or of worlds for a team."""
     worlds = torch.export.Dim("worlds", min=1)
     rows = worlds if program.team == 1 else program.team * worlds
     inputs = {"observation": torch.zeros(2 * program.team, program.num_inputs)}

@@ -13,8 +13,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from esp_cli.files.failures import attempting, own_words
-from esp_cli.files.formatting import nearest, shortened
+from esp_cli.files.formatting import attempting, nearest, own_words, shortened
 from esp_cli.files.opening import read_regular
 from esp_cli.files.writing import replace_file
 from esp_envs.errors import UserError
@@ -137,7 +136,6 @@ def validated(model: type[BaseModel], values: Mapping[str, object], section: str
 
 
 def _numbers(value: object) -> list[bool | int | float]:
-    """Return the numbers and flags of a value, or of a list."""
     items = value if isinstance(value, list | tuple) else [value]
     return [item for item in items if isinstance(item, bool | int | float)]
 
@@ -212,10 +210,7 @@ def _bounded(number: str) -> int:
 
 
 def one_sentence(error: ValidationError, model: type[BaseModel], section: str = "", owner: str = "") -> str:
-    """Say what is wrong with the first bad setting of a model, and what could stand there.
-
-    `section` stands before the name of a setting; `owner` is what has the settings, by default the section.
-    """
+    """Say what is wrong with the first bad setting of a model, and what could stand there."""
     first = error.errors(include_url=False)[0]
     name = shortened(".".join([*([section] if section else []), *(str(part) for part in first["loc"])]))
     if first["type"] == "extra_forbidden":
@@ -257,10 +252,7 @@ def read_table(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def flat(table: Mapping[str, Any], whole: Collection[str] = (), prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the dotted name and the value of everything in nested tables: {"a": {"b": 1}} -> ("a.b", 1).
-
-    Tables whose dotted names are among `whole` are values themselves.
-    """
+    """Yield dotted name and value of all in nested tables, {"a": {"b": 1}} -> ("a.b", 1), bar the `whole`."""
     for key, value in table.items():
         name = f"{prefix}{key}"
         if isinstance(value, Mapping) and name not in whole:

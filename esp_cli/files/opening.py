@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from esp_cli.files.failures import attempting
+from esp_cli.files.formatting import attempting
 from esp_envs.errors import UserError
 
 
@@ -131,7 +131,6 @@ def taking_turns(folder: Path) -> Iterator[None]:
 
 
 def _holder(content: bytes) -> str:
-    """Name the process that a lock file names."""
     try:
         owner = json.loads(content)
         return f"process {int(owner['pid'])} on {str(owner['host'])[:64]!r}"
@@ -199,7 +198,6 @@ def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
 
 
 def _regular(descriptor: int, path: str | os.PathLike[str]) -> int:
-    """Return the descriptor of a regular file; close that of anything else."""
     mode = os.fstat(descriptor).st_mode
     if stat.S_ISREG(mode):
         return descriptor

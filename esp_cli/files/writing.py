@@ -124,7 +124,6 @@ def write_all(descriptor: int, content: bytes) -> None:
 
 @contextlib.contextmanager
 def _folder_of(path: Path) -> Iterator[int]:
-    """Yield a descriptor of the folder of a file."""
     descriptor = open_folder(path.parent)
     try:
         yield descriptor

@@ -39,11 +39,6 @@ class SymmetryCallback(Callback):
         self.symmetry, self.coefficient, self.augment, self.roles = symmetry, coefficient, augment, roles
 
     def on_setup(self) -> None:
-        """Wrap the losses of the experiment.
-
-        Raises:
-            UserError: there is no such group, or its algorithm has another kind of loss.
-        """
         losses = self.experiment.losses
         chosen = self.symmetry if isinstance(self.symmetry, Mapping) else dict.fromkeys(losses, self.symmetry)
         for group, symmetry in chosen.items():

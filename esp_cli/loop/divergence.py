@@ -39,9 +39,6 @@ def policy_divergence(transform: Transform, there: Policy, here: Policy, samples
 
     Returns:
         [..., N], or [...] without an agent axis.
-
-    Raises:
-        UserError: another kind of distribution, another number of actions, or different shapes.
     """
     there, here = _bare(there), _bare(here)
     if transform.action_index is not None:
@@ -124,11 +121,7 @@ def _choices_apart(p: Tensor, q: Tensor) -> Tensor:
 
 
 def _normals_apart(transform: Transform, there: td.Normal, here: td.Normal) -> Tensor:
-    """Return KL[N(K^-1 m', K^-1 diag(v') K) || N(m, diag(v))].
-
-    It is sum((c + (m - K^-1 m')^2) / v - 1 + log v - log v') / 2 with c the diagonal of K^-1 diag(v') K, since the
-    determinant of a turned covariance is that of diag(v').
-    """
+    """Return KL[N(K^-1 m', K^-1 diag(v') K) || N(m, diag(v))]."""
     pulled = _both(transform, there.loc, here.loc)
     variance, volume = transform.pull_back_variance(there.variance), transform.values(there.variance.log().sum(-1))
 
@@ -141,10 +134,7 @@ def _normals_apart(transform: Transform, there: td.Normal, here: td.Normal) -> T
 
 @torch.no_grad()
 def _commutes(transform: Transform, like: Tensor, squash: list[td.Transform]) -> bool:
-    """Whether turning before a squash is turning after it, tried on latent actions spread over [-2, 2].
-
-    A policy's own means do not tell: near 0 a tanh is a line, and turns commute with that.
-    """
+    """Whether turning before a squash is turning after it, tried on latent actions spread over [-2, 2]."""
     spread = torch.arange(like.numel(), device=like.device, dtype=torch.float64).mul_(_GOLDEN).frac_().mul_(4).sub_(2)
     latent = spread.to(like.dtype).view_as(like)
     turned = _pulled(transform, latent)

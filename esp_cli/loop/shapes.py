@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, cast
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from esp_cli.symmetry import Transform
 from esp_envs.errors import UserError
@@ -37,12 +37,10 @@ class Augmented(tuple[Any, ...]):
 
     @property
     def obs(self) -> Tensor:
-        """[..., N, D]."""
         return cast("Tensor", self[0])
 
     @property
     def action(self) -> Tensor:
-        """In the shape that was given."""
         return cast("Tensor", self[1])
 
     @property
@@ -52,7 +50,6 @@ class Augmented(tuple[Any, ...]):
 
     @property
     def per_agent(self) -> tuple[Tensor, ...]:
-        """The numbers that went along."""
         return cast("tuple[Tensor, ...]", self[-1])
 
 
@@ -191,3 +188,27 @@ def _check_tensor(name: str, x: object) -> None:
 def _agents(spaces: Spaces) -> tuple[int, ...]:
     """Return the agent axis, where there is one."""
     return (spaces.num_agents,) if spaces.num_agents > 1 else ()
+
+
+class Draws(nn.Module):
+    """Keeps a generator. Its state is all that `state_dict` holds, and a file without it loads too."""
+
+    def __init__(self, shown: str, observation: Layout, action: ActionSpace, seed: int) -> None:
+        super().__init__()
+        acts = f"{action.count} choices" if isinstance(action, Discrete) else action.layout.summary
+        self._shown = f"{shown}\nobservation: {observation.summary}\naction: {acts}"
+        self.generator = torch.Generator().manual_seed(seed)
+
+    def extra_repr(self) -> str:
+        return self._shown
+
+    def get_extra_state(self) -> Tensor:
+        return self.generator.get_state()
+
+    def set_extra_state(self, state: Tensor) -> None:
+        self.generator.set_state(state.cpu())
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        """Load the draws, or leave them as they are: files of loops that were written before have none."""
+        state_dict.setdefault(f"{prefix}_extra_state", self.get_extra_state())
+        super()._load_from_state_dict(state_dict, prefix, *rest)

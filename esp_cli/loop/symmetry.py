@@ -13,9 +13,9 @@ from torch import Tensor
 
 from esp_cli.loop import shapes
 from esp_cli.loop.divergence import Policy, policy_divergence
-from esp_cli.loop.draws import Draws
 from esp_cli.loop.shapes import (
     Augmented,
+    Draws,
     act,
     carry,
     carry_along,

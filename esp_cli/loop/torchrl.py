@@ -90,11 +90,7 @@ class SymmetricLoss(nn.Module):
         self.augment, self.roles = augment, roles
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the losses of data [B, ...], with consistency inside, "policy_symmetry" and "value_symmetry" beside.
-
-        Raises:
-            UserError: the numbers under a key do not fit.
-        """
+        """Return the losses of data [B, ...], consistency inside, "policy_symmetry" and "value_symmetry" beside."""
         if not self.augment and not self.coefficient:
             return self.loss(tensordict)
         parts, transforms = with_copies(
@@ -103,7 +99,7 @@ class SymmetricLoss(nn.Module):
         batches: list[Any] = [torch.cat(parts, 0)] if self.augment else parts
         answers = [self._ask(batch) for batch in batches]
         losses, size = answers[0].losses, len(tensordict)
-        if (priority := self._priority_key) in batches[0].keys(True):
+        if (priority := getattr(self.loss.tensor_keys, "priority", "td_error")) in batches[0].keys(True):
             tensordict.set(priority, batches[0].get(priority)[:size])
         gaps = {}
         if not self.mixes:
@@ -135,10 +131,6 @@ class SymmetricLoss(nn.Module):
         read = [*self.loss.actor_network.in_keys, *self.loss.critic_network.in_keys]
         read += [keys.action, keys.sample_log_prob, keys.advantage, keys.value_target, keys.value]
         return data.select(*read, strict=False)
-
-    @property
-    def _priority_key(self) -> Any:
-        return getattr(self.loss.tensor_keys, "priority", "td_error")
 
     def _ask(self, data: TensorDictBase) -> _Answers:
         """Return the losses of data, and what the networks said of it on the way."""

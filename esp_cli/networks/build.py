@@ -13,8 +13,7 @@ import torch
 from pydantic import BeforeValidator, SerializeAsAny
 
 from esp_cli.files.documents import validate
-from esp_cli.networks.contract import ActivationName, Network, NetworkConfig
-from esp_cli.networks.io_spec import IoSpec
+from esp_cli.networks.contract import ActivationName, IoSpec, Network, NetworkConfig
 from esp_cli.networks.plain import MlpConfig, PlainConfig
 from esp_cli.networks.symmetrised import Symmetrised
 from esp_envs.errors import UserError
@@ -44,11 +43,7 @@ _FLAT_FIELDS = {"activation", "precision", "layer_norm", "group", "separate_part
 
 
 def network_class(name: object) -> type[NetworkConfig]:
-    """Return the settings class of a network.
-
-    Raises:
-        UserError: there is no such network.
-    """
+    """Return the settings class of a network."""
     return NETWORKS[str(name)]
 
 
@@ -82,19 +77,7 @@ def build_network(
     output_gain: float,
     io: IoSpec | None = None,
 ) -> Network:
-    """Build the network of the settings.
-
-    Args:
-        generators: one CPU generator per seed, which draw the initial weights.
-        inputs: width of an input row.
-        outputs: width of an output row.
-        config: shape.
-        output_gain: orthogonal gain of the last layer.
-        io: what the rows mean; networks with symmetry, and the average over a group, need it.
-
-    Raises:
-        UserError: the network does not fit what is read and written there.
-    """
+    """Build the network of the settings; `io` says what rows mean, for symmetry and the average over a group."""
     network = config.build(generators, inputs, outputs, output_gain, io)
     if config.symmetrise is None:
         return network

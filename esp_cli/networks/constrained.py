@@ -11,23 +11,18 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from esp_cli.networks.contract import VJP, ActivationName, Memoryless, Network, NetworkConfig
-from esp_cli.networks.io_spec import IoSpec
+from esp_cli.networks.contract import VJP, ActivationName, IoSpec, Memoryless, Network, NetworkConfig
 from esp_cli.networks.layers import GAINS, orthogonal
 from esp_cli.networks.perceptron import Shape, affine, perceptron, perceptron_with_vjp
 from esp_cli.symmetry import FiniteGroup
-from esp_cli.symmetry.intertwiners import Block, block_width, intertwiners, regular
+from esp_cli.symmetry.maps import Block, block_width, intertwiners, regular
 from esp_envs.errors import UserError
 
 Relaxation = Literal["residual", "weights"]
 
 
 def copies_for(width: int, group: FiniteGroup, banks: int = 1) -> int:
-    """Return how many regular features have about as many weights between two layers as `width` plain numbers.
-
-    Two layers of m features of a group of order G share m m G free numbers in each bank of filters, so m is width /
-    sqrt(banks G).
-    """
+    """Return how many regular features have about as many weights between two layers as `width` plain numbers."""
     return max(1, round(width / math.sqrt(banks * group.order)))
 
 
@@ -98,7 +93,6 @@ class ConstrainedLinear(nn.Module):
             self.free_bias = nn.Parameter(torch.zeros(len(generators), 1, full.shape[2]))
 
     def weight(self) -> Tensor:
-        """Return W: [S, in, out]."""
         like = next(iter(self.weights.values()))
         rows = []
         for a, source in enumerate(self.inputs):
@@ -122,7 +116,6 @@ class ConstrainedLinear(nn.Module):
         return held + self.relax * (held * first + self.bank.weight() * second)
 
     def bias(self) -> Tensor:
-        """Return b: [S, 1, out]."""
         like = next(iter(self.weights.values()))
         parts = []
         for b, target in enumerate(self.outputs):
@@ -134,7 +127,6 @@ class ConstrainedLinear(nn.Module):
         return held + self.relax * self.free_bias if self.relax and self.relaxation == "residual" else held
 
     def forward(self, x: Tensor) -> Tensor:
-        """Apply the layer."""
         return affine(self.bias(), x, self.weight())
 
 
@@ -161,11 +153,7 @@ class EquivariantConfig(NetworkConfig):
 
 
 class Equivariant(Memoryless):
-    """A perceptron of regular features over a row of scalars, planar vectors and the like: equivariant in every layer.
-
-    Hidden widths are those of a plain perceptron with about as many weights. A value is invariant, an action's numbers
-    transform as the action does.
-    """
+    """A perceptron of regular features over scalars, planar vectors and the like: equivariant in every layer."""
 
     def __init__(
         self, generators: Sequence[torch.Generator], io: IoSpec, config: EquivariantConfig, output_gain: float
@@ -188,7 +176,6 @@ class Equivariant(Memoryless):
         self._shape = Shape(config.activation, activate_output=False, precision=torch.float32)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map [S, B, in] to [S, B, out]."""
         return perceptron(self._shape, [x], self._plain())
 
     def unroll_with_vjp(self, x: Tensor, truncation: int = 0) -> tuple[Tensor, VJP]:

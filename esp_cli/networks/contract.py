@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Annotated, ClassVar, Literal, NamedTuple
 
@@ -12,8 +13,50 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from esp_cli.files.documents import Strict
-from esp_cli.networks.io_spec import IoSpec
+from esp_cli.symmetry import FiniteGroup, admit, parse_group
+from esp_cli.symmetry.maps import Block, action_blocks, layout_blocks, trivial
 from esp_envs.errors import UserError
+from esp_envs.spec import Layout, Spaces, joint_layout
+
+Reads = Literal["state", "observations", "own"]
+
+
+@dataclass(frozen=True)
+class IoSpec:
+    """The input and output of a network in a task."""
+
+    spaces: Spaces  # of the task
+    # the global state, all agents' observations in a row, or one agent's own observation; rows of own observations
+    # hold the agents of a world side by side
+    reads: Reads
+    # number of invariant outputs; None for an actor, whose outputs are one number per discrete action, or the numbers
+    # of a continuous action
+    num_values: int | None = None
+
+    @property
+    def layout(self) -> Layout:
+        if self.reads == "observations":
+            return joint_layout(self.spaces.observation, self.spaces.num_agents)
+        return self.spaces.state if self.reads == "state" else self.spaces.observation
+
+    def group(self, name: str) -> FiniteGroup:
+        """Return a group that leaves agents in their places by its name."""
+        group = parse_group(name, self.spaces.num_agents)
+        if not isinstance(group, FiniteGroup) or any(element.permutation for element in group.elements):
+            raise UserError(f"a network cannot be built for '{name}'; choose a finite group that moves no agents")
+        if field := next((field for field in self.layout.fields if field.sorted_by), None):
+            raise UserError(f"no network is equivariant on '{field.name}', whose items are sorted; use mlp or set")
+        admit(name, group, self.spaces, instead="use another network")
+        return group
+
+    def inputs(self, group: FiniteGroup) -> list[Block]:
+        return layout_blocks(self.layout, group)
+
+    def outputs(self, group: FiniteGroup) -> list[Block]:
+        if self.num_values is not None:
+            return [trivial(group, self.num_values)]
+        return action_blocks(self.spaces.action, group)
+
 
 ActivationName = Literal["relu", "tanh"]
 # the vector-Jacobian product of a network: from the slope of a loss by its outputs to those by its parameters in order,
@@ -88,20 +131,11 @@ class NetworkConfig(Strict, ABC):
         return frozenset()
 
     def decided(self, steps: int, device: str) -> NetworkConfig:
-        """Return these settings with what depends on the run decided, as it is stored with the run.
-
-        Args:
-            steps: environment steps per seed.
-            device: "cpu" or "cuda".
-        """
+        """Return settings with what depends on steps per seed and "cpu" or "cuda" decided, as a run stores them."""
         return self
 
     def least_parameters(self, inputs: int) -> int:
-        """Return a lower bound of the number of weights; a file with fewer is damaged.
-
-        Args:
-            inputs: width of an input row.
-        """
+        """Return a lower bound of the number of weights for rows of `inputs` numbers; a file with fewer is damaged."""
         # A constrained layer rounds its number of features, and pictures enter by few weights.
         return sum(a * b for a, b in pairwise((1, *self.hidden))) // 4
 

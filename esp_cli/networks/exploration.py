@@ -19,11 +19,7 @@ from esp_envs.spec import ActionSpace, Continuous, Discrete
 
 
 class ExploringHead(Head):
-    """A head with a measure of exploration per seed.
-
-    Attributes:
-        epsilon: [S] in [0, 1].
-    """
+    """A head with a measure of exploration per seed, `epsilon` [S] in [0, 1]."""
 
     def __init__(self, num_seeds: int) -> None:
         nn.Module.__init__(self)  # not super(): the constructor of a head beside this one wants other arguments
@@ -31,7 +27,6 @@ class ExploringHead(Head):
         self.register_buffer("epsilon", torch.ones(num_seeds))
 
     def explore(self, epsilon: float) -> None:
-        """Set the measure of exploration of all seeds."""
         self.epsilon.fill_(epsilon)
 
     def _epsilon(self, like: Tensor) -> Tensor:

@@ -98,7 +98,6 @@ class Categorical(Choice):
         return drawn(torch.rand, shape, generators)
 
     def normalise(self, outputs: Tensor) -> Tensor:
-        """Return log-probabilities."""
         # With the action axis outermost in memory: over so few actions, softmax along the contiguous axis is 25 times
         # slower on a CPU than over vectors of rows.
         return torch.log_softmax(outputs.movedim(-1, 1).contiguous(), 1).movedim(1, -1)
@@ -116,7 +115,6 @@ class Categorical(Choice):
         return best(log_probs)
 
     def log_prob(self, log_probs: Tensor, action: Tensor) -> Tensor:
-        """Return log pi(action): [S, B, N]."""
         return log_probs.gather(-1, action.unsqueeze(-1)).squeeze(-1)
 
     def entropy(self, log_probs: Tensor) -> Tensor:
@@ -172,13 +170,11 @@ class BoundedGaussian(Head):
         return outputs
 
     def log_prob(self, outputs: Tensor, action: Tensor) -> Tensor:
-        """Return the latent Gaussian's log density: [S, B, N]."""
         log_std = self.log_deviation(outputs)
         z = (action - outputs) * (-log_std).exp()
         return -(0.5 * z.square() + log_std + 0.5 * math.log(2 * math.pi)).sum(-1)
 
     def entropy(self, outputs: Tensor) -> Tensor:
-        """Return the latent Gaussian's entropy: [S, B, N]."""
         entropy = (self.log_deviation(outputs) + 0.5 * math.log(2 * math.pi * math.e)).sum(-1)
         return entropy.expand(outputs.shape[:-1])
 

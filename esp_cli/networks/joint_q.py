@@ -5,23 +5,23 @@ Shape letters: S seeds, W agents' scenes (any axes), N agents, C values (1 or N)
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
+from torch.autograd import Function
+from torch.nn.functional import elu
 
+from esp_cli.networks.kernels.library import begin, computes
+from esp_cli.networks.kernels.mixer import CompiledMixer
 from esp_cli.networks.layers import SeedLinear, SeedMLP
-from esp_cli.networks.perceptron import affine
+from esp_cli.networks.perceptron import CACHED_ROWS, affine
 from esp_envs.spec import Spaces
 
 
 class SharedCriticInput:
-    """One value for agents that share their reward: the critic sees a scene once, with all actions in agent order.
-
-    Args:
-        spec: the task.
-        reads: what the critic sees of a scene: the global state, or all observations.
-    """
+    """One value for agents that share their reward: the critic sees a scene once, with all actions in agent order."""
 
     def __init__(self, spec: Spaces, reads: Literal["state", "observations"]) -> None:
         self.spec, self.reads = spec, reads
@@ -68,7 +68,6 @@ class PerAgentCriticInput(SharedCriticInput):
 
     @property
     def width(self) -> int:
-        """Numbers that the critic sees of a scene, without actions and time."""
         return super().width + (self.spec.observation.width if self.reads == "state" else 0)
 
     def rows(self, obs: Tensor, state: Tensor) -> Tensor:
@@ -82,7 +81,6 @@ class PerAgentCriticInput(SharedCriticInput):
         return in_circular_order(action)
 
     def value(self, critic: nn.Module, seen: Tensor, action: Tensor) -> Tensor:
-        """Return Q [S, W, N] of encoded joint actions [S, W, N, A]."""
         return super().value(critic, seen, action).squeeze(-1)
 
     def exchanged(self, critic: nn.Module, seen: Tensor, joint: Tensor, others: Tensor) -> Tensor:
@@ -134,3 +132,63 @@ def _one_by_one(network: nn.Module, rows: Tensor, items: Tensor, others: Tensor)
     joint = torch.where(own, others.unsqueeze(4), items.view(-1, num_rows, 1, 1, *items.shape[2:])).flatten(-2)
     full = torch.cat([rows.view(-1, num_rows, 1, 1, rows.shape[-1]).expand(*joint.shape[:-1], -1), joint], -1)
     return network(full.flatten(1, 3)).unflatten(1, (num_rows, num_items, num_others))
+
+
+HYPER_GAIN = 0.5  # orthogonal gain of the hypernetwork's last layer
+
+
+class MonotonicMixer(nn.Module):
+    """Q_tot = w_2(s)' elu(W_1(s)' q + b_1(s)) + b_2(s) with w, W >= 0 (Rashid et al., 2018), for S seeds.
+
+    One hypernetwork reads the state and gives all weights and biases; absolute values make the weights non-negative.
+    """
+
+    def __init__(
+        self,
+        generators: Sequence[torch.Generator],
+        num_agents: int,
+        state_width: int,
+        width: int,
+        hidden: int,
+        compiled: bool = False,
+    ) -> None:
+        super().__init__()
+        self.num_agents, self.width = num_agents, width
+        if compiled:
+            begin("mixer")
+        outputs = num_agents * width + 2 * width + 1
+        self.hypernetwork = SeedMLP(generators, (state_width, hidden, outputs), "relu", HYPER_GAIN, compiled=compiled)
+
+    def forward(self, values: Tensor, state: Tensor) -> Tensor:
+        """Mix the agents' values [S, ..., N] by the state [S, ..., state width] to [S, ...]."""
+        own = values.reshape(values.shape[0], -1, values.shape[-1])
+        if computes(self.hypernetwork.compiled, state):
+            given = (own.contiguous(), state, *self.hypernetwork.parameters())
+            return _CompiledMixed.apply(self.width, torch.is_grad_enabled(), *given).view(values.shape[:-1])  # type: ignore[no-untyped-call]
+        seen, size = state.reshape(len(state), -1, state.shape[-1]), max(1, CACHED_ROWS // values.shape[0])
+        pieces = [self._mixed(*piece) for piece in zip(own.split(size, 1), seen.split(size, 1), strict=True)]
+        return torch.cat(pieces, 1).view(values.shape[:-1])
+
+    def _mixed(self, own: Tensor, seen: Tensor) -> Tensor:
+        """Return the team's values [S, B] of own [S, B, N] in states as they are seen [S, B, width]."""
+        rows = self.hypernetwork(seen, rows_innermost=True).transpose(1, 2)
+        first, bias, second, offset = rows.split((self.num_agents * self.width, self.width, self.width, 1), 1)
+        weighed = first.unflatten(1, (self.num_agents, self.width)).abs() * own.transpose(1, 2).unsqueeze(2)
+        hidden = elu(weighed.sum(1) + bias)
+        return (hidden * second.abs()).sum(1) + offset.squeeze(1)
+
+
+class _CompiledMixed(Function):
+    """The mixer by the kernel, hypernetwork and all: own [S, B, N] in states [S, ..., width] to [S, B]."""
+
+    @staticmethod
+    def forward(ctx, width, keep, own, state, *parameters):  # type: ignore[no-untyped-def]
+        ctx.run = CompiledMixer(own, [state], parameters, width, keep)
+        ctx.save_for_backward(own, state, *parameters)  # so that autograd notices a change of them
+        return ctx.run.outputs.detach()  # the tensor itself would hold, by its grad_fn, what holds it
+
+    @staticmethod
+    def backward(ctx, grad):  # type: ignore[no-untyped-def]
+        _, state, *_ = ctx.saved_tensors
+        by_own, grads, (by_state,) = ctx.run.unmix(grad, ctx.needs_input_grad[4:], ctx.needs_input_grad[3:4])
+        return None, None, by_own, None if by_state is None else by_state.view(state.shape), *grads

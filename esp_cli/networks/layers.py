@@ -34,7 +34,6 @@ class SeedLinear(nn.Module):
         self.bias = nn.Parameter(torch.zeros(len(generators), 1, outputs))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Apply the layer."""
         return affine(self.bias, x, self.weight)
 
 
@@ -101,10 +100,7 @@ class SeedMLP(nn.Module):
         return self._from_layer(0, parts, rows_innermost)
 
     def from_first_sums(self, sums: Tensor) -> Tensor:
-        """Map what the first layer gives, x W_1 + b_1 before its activation, [S, B, H], to [S, B, out].
-
-        Works in place on `sums`. Not with layer normalisation.
-        """
+        """Map the first layer's sums x W_1 + b_1 [S, B, H] to [S, B, out], in place; not with layer normalisation."""
         if len(self.layers) == 1 and not self.activate_output:
             return sums.float()
         x = activate_(sums, self.activation)
@@ -112,10 +108,7 @@ class SeedMLP(nn.Module):
 
     @torch.no_grad()
     def idle_units(self, x: Tensor) -> Tensor:
-        """Return the share of hidden units that are 0 for every row of x [S, B, in]: [S]; of relu networks.
-
-        Such a unit gets no gradient and is lost to the network (Sokar et al., 2023).
-        """
+        """Return the share [S] of a relu network's hidden units that are 0 for every row of x (Sokar et al., 2023)."""
         x = x if self.norms is None else self.norms[0](x)
         idle = []
         for k, layer in enumerate(self.layers if self.activate_output else self.layers[:-1]):

@@ -18,12 +18,11 @@ from torch import Tensor, nn
 from torch.autograd import Function
 
 from esp_cli.networks.constrained import ConstrainedLinear, copies_for
-from esp_cli.networks.contract import Memoryless, Network, NetworkConfig
-from esp_cli.networks.io_spec import IoSpec
+from esp_cli.networks.contract import IoSpec, Memoryless, Network, NetworkConfig
 from esp_cli.networks.layers import GAINS
 from esp_cli.networks.perceptron import affine
 from esp_cli.symmetry import FiniteGroup
-from esp_cli.symmetry.intertwiners import Block, layout_blocks, regular, trivial, with_pixels
+from esp_cli.symmetry.maps import Block, layout_blocks, regular, trivial, with_pixels
 from esp_envs.errors import UserError
 from esp_envs.spec import Field, Items, Kind, Layout, others_of
 
@@ -36,11 +35,7 @@ _LOT = 16  # the number of encoded pictures is a multiple of this, so that few s
 
 
 class PictureEncoder(nn.Module):
-    """Convolutions for S seeds, each followed by relu, then a maximum over all places.
-
-    Shape:
-        [S, B, pixels of all channels] -> [S, B, width].
-    """
+    """Convolutions for S seeds, each before a relu, then a maximum over places: [S, B, pixels] -> [S, B, width]."""
 
     def __init__(self, generators: Sequence[torch.Generator], field: Field, group: FiniteGroup) -> None:
         super().__init__()
@@ -76,7 +71,6 @@ class PictureEncoder(nn.Module):
         return features.flatten(0, 1).index_select(0, index).unflatten(0, place.shape)
 
     def encode(self, pictures: Tensor) -> Tensor:
-        """Encode every picture."""
         return self.responses(self.as_pictures(pictures))[-1].flatten(2, 3).amax(2)
 
     def as_pictures(self, rows: Tensor) -> Tensor:
@@ -99,10 +93,7 @@ class PictureEncoder(nn.Module):
 
 
 class _Patches(Function):
-    """Every patch that a filter looks at: [S, B, H, W, C] to [S, B * h * w, side * side * C].
-
-    Torch's backward of the view adds single numbers; this backward adds whole pictures.
-    """
+    """Every patch that a filter looks at: [S, B, H, W, C] to [S, B * h * w, side * side * C]; adds rows backward."""
 
     @staticmethod
     def forward(ctx, x, side, stride):  # type: ignore[no-untyped-def]

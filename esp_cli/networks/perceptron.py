@@ -76,12 +76,10 @@ def _split(x: Tensor, size: int) -> Sequence[Tensor]:
 
 
 def _size(x: Tensor) -> int:
-    """Return the rows per seed of a piece."""
     return max(1, CACHED_ROWS // x.shape[0])
 
 
 def _joined(outputs: list[Tensor]) -> Tensor:
-    """Return the outputs of all pieces, laid out in memory as each."""
     if len(outputs) == 1:
         return outputs[0].float()
     if outputs[0].stride(1) == 1:
@@ -90,7 +88,6 @@ def _joined(outputs: list[Tensor]) -> Tensor:
 
 
 def _run(shape: Shape, x: Tensor, parameters: Sequence[Tensor]) -> list[Tensor]:
-    """Return x and what every layer gives."""
     run, last = [x], len(parameters) // 2 - 1
     for k in range(last + 1):
         weight, bias = parameters[2 * k], parameters[2 * k + 1]
@@ -115,7 +112,6 @@ class _Pass:
         self.outputs = _joined([run[-1] for run in self._runs])
 
     def backward(self, grad: Tensor) -> list[Tensor]:
-        """Return the gradients by the parameters, of what has the gradient `grad` by the outputs."""
         with torch.no_grad():
             grads, _ = self.backward_to(grad, [True] * (2 * len(self._weights)), [])
         return [g for g in grads if g is not None]
@@ -204,7 +200,6 @@ def _down(grad: Tensor, weight: Tensor) -> Tensor:
 
 
 def _hidden(bias: Tensor, x: Tensor, weight: Tensor, activation: str) -> Tensor:
-    """Return act(x W + b)."""
     if activation == "relu" or x.dtype == torch.bfloat16:
         return activate_(affine(bias, x, weight), activation)
     return _tanh_from_sigmoid_(affine(bias, x, weight, 2.0).sigmoid_())

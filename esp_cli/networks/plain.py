@@ -10,8 +10,7 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from esp_cli.networks.contract import VJP, ActivationName, Memoryless, Network, NetworkConfig
-from esp_cli.networks.io_spec import IoSpec
+from esp_cli.networks.contract import VJP, ActivationName, IoSpec, Memoryless, Network, NetworkConfig
 from esp_cli.networks.kernels.library import has_compiler
 from esp_cli.networks.layers import GAINS, SeedLayerNorm, SeedLinear, SeedMLP
 from esp_cli.networks.perceptron import Shape, perceptron

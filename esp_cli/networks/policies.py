@@ -24,10 +24,7 @@ Weights = Tensor | float  # A number, or [S, 1, R]
 
 
 class Policies(ABC):
-    """What a network outputs for originals and copies, as policies.
-
-    A slope is None at first; `add_...` return it with more added.
-    """
+    """What a network outputs for originals and copies, as policies."""
 
     @abstractmethod
     def log_prob(self, action: Tensor, learned: int) -> Tensor:
@@ -106,10 +103,6 @@ class CompiledCategoricalPolicies(Policies):
     """What `CategoricalPolicies` are, by a kernel: of copies that differ in the order of their outputs alone.
 
     A slope is a list of what the kernel is asked to add up.
-
-    Args:
-        outputs: [S, P B, T, N, A] of a network.
-        orders: [S or 1, P, A] which output of each part is the original's action.
     """
 
     def __init__(self, outputs: WithVJP, orders: Tensor) -> None:
@@ -160,12 +153,6 @@ class GaussianPolicies(Policies):
 
     An item that changes places in a copy has the deviation of its place there. A slope is that by the means
     [S, P, R, W] and that by the log deviations [S, items].
-
-    Args:
-        outputs: [S, P B, T, N, W] means, under autograd.
-        frame: of the originals.
-        log_std: the parameter [S, items].
-        item: [W], the item of each number.
     """
 
     def __init__(self, outputs: WithVJP, frame: Frame, log_std: Tensor, item: Tensor) -> None:

@@ -1,4 +1,4 @@
-"""Policies: an actor network shared by all agents, and the head that reads its outputs."""
+"""Policies, whose actor is shared by all agents and read by a head, and value functions."""
 
 from __future__ import annotations
 
@@ -8,29 +8,19 @@ from functools import cached_property
 import torch
 from torch import Tensor, nn
 
-from esp_cli.networks.build import Network, NetworkConfig, build_network
-from esp_cli.networks.contract import WithVJP
+from esp_cli.networks.build import build_network
+from esp_cli.networks.contract import IoSpec, Network, NetworkConfig, Reads, WithVJP
 from esp_cli.networks.heads import BoundedGaussian, Categorical, Head, build_head, masked
-from esp_cli.networks.io_spec import IoSpec
 from esp_cli.networks.kernels.library import begin
 from esp_cli.networks.plain import PlainConfig
-from esp_cli.networks.separate import Separate, action_parts
-from esp_envs.spec import Spaces
+from esp_cli.networks.symmetrised import Separate, action_parts
+from esp_envs.spec import Spaces, TaskSpec
 
 POLICY_GAIN = 0.01  # orthogonal gain of the last layer: the first policy is nearly uniform (MAPPO paper's default)
 
 
 class Policy(nn.Module):
-    """S policies of one shape; agents share parameters within a seed.
-
-    Args:
-        spec: the task.
-        network: shape of the actor.
-        generators: one CPU generator per seed, for the initial weights.
-        head: reads the actor's outputs.
-        output_gain: orthogonal gain of the actor's last layer.
-        num_extra: numbers per agent that the actor sees beside its observation.
-    """
+    """S policies of one shape; agents share parameters within a seed."""
 
     head: Head
 
@@ -64,10 +54,7 @@ class Policy(nn.Module):
         return self.actor.initial_memory(self.num_seeds, num_envs * self.num_agents, like)
 
     def step(self, obs: Tensor, memory: Tensor, action_mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return the normalised outputs [S, E, N, outputs] for obs [S, E, N, D], and the next memory.
-
-        The action mask [S, E, N, A] holds the allowed actions; None allows all.
-        """
+        """Return outputs, normalised, for obs [S, E, N, D] and allowed actions [S, E, N, A], and the memory."""
         outputs, memory = self.actor.step(obs.flatten(1, 2), memory)
         return self._normalised(outputs.unflatten(1, obs.shape[1:3]), action_mask), memory
 
@@ -165,3 +152,45 @@ class HistoryPolicy(Policy):
             rows = torch.cat([rows, previous], -1)
         allowed = None if action_mask is None else action_mask[:, :, : obs.shape[2]]
         return self._normalised(self.actor.unroll_agents(rows), allowed)
+
+
+class Critic(nn.Module):
+    """S critics of one shape.
+
+    It reads the global "state" or all agents' "observations" in a row and returns one value for a shared reward, else
+    one per agent; or it reads each agent's "own" observation and returns that agent's value, with weights that all
+    share.
+    """
+
+    def __init__(
+        self, spec: TaskSpec, reads: Reads, network: NetworkConfig, generators: Sequence[torch.Generator]
+    ) -> None:
+        super().__init__()
+        self.reads = reads
+        own = reads == "own"
+        self.num_values = 1 if spec.shared_reward and not own else spec.num_agents
+        observed = spec.observation.width
+        width = {"state": spec.state.width, "observations": spec.num_agents * observed, "own": observed}[reads]
+        outputs = 1 if own else self.num_values
+        self.network = build_network(generators, width, outputs, network, 1.0, IoSpec(spec, reads, outputs))
+
+    def unroll(self, obs: Tensor, state: Tensor, truncation: int = 0) -> Tensor:
+        """Return the values [S, B, T, C] over whole episodes obs [S, B, T, N, D] and state [S, B, T, state width]."""
+        return self._values(self.network.unroll_agents(self._rows(obs, state), truncation))
+
+    def unroll_with_vjp(self, obs: Tensor, state: Tensor, truncation: int = 0) -> WithVJP:
+        outputs, vjp = self.network.unroll_with_vjp(self._rows(obs, state), truncation)
+        return WithVJP(self._values(outputs), lambda slope: vjp(slope.view(outputs.shape)), self._learned)
+
+    @cached_property
+    def _learned(self) -> list[Tensor]:
+        """The parameters; to list them takes as long as a product."""
+        return [*self.network.parameters()]
+
+    def _rows(self, obs: Tensor, state: Tensor) -> Tensor:
+        if self.reads == "own":
+            return obs
+        return (state if self.reads == "state" else obs.flatten(-2)).unsqueeze(3)
+
+    def _values(self, outputs: Tensor) -> Tensor:
+        return outputs.squeeze(4 if self.reads == "own" else 3)

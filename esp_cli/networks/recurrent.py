@@ -41,11 +41,7 @@ class SeedGRU(nn.Module):
         return torch.lerp(candidate, h, update)
 
     def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
-        """Advance through whole episodes from empty memory: x [S, T, B, in] -> every memory [S, T, B, H].
-
-        The same as `forward` step by step, with a backward written by hand that works in place on what fits a cache;
-        gradients through time are cut every `truncation` steps (0: never).
-        """
+        """Advance through whole episodes from empty memory: x [S, T, B, in] -> every memory [S, T, B, H]."""
         layers = (self.input.weight, self.input.bias, self.recurrent.weight, self.recurrent.bias)
         if torch.is_grad_enabled():
             return _Unrolled.apply(x, truncation, self.compiled, *layers)  # type: ignore[no-untyped-call]
@@ -63,10 +59,7 @@ def _gates(weight: Tensor) -> Tensor:
 
 
 class _Unroll:
-    """All steps of a gated recurrent unit from empty memory by torch, of x [S, T, B, in].
-
-    `layers` are W, its bias, U and its bias. There is a `backward` where `keep` asks for one.
-    """
+    """All steps of a gated recurrent unit from empty memory by torch, of x [S, T, B, in]."""
 
     def __init__(self, x: Tensor, layers: Sequence[Tensor], truncation: int, keep: bool) -> None:
         weight, bias, recurrent, inner_bias = layers
@@ -154,7 +147,6 @@ class _Learned:
         return passed.baddbmm_(d[0], u_r).baddbmm_(d[1], u_z).baddbmm_(d[3], u_n)
 
     def gradients(self) -> list[Tensor]:
-        """Return those by W, its bias, U and its bias."""
         r, z, n, inner = self.by_sums
         parts = ((*self.by_inputs,), (r, z, n), (*self.by_memories,), (r, z, inner))
         return [torch.cat(gates, -1) for gates in parts]

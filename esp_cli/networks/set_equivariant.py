@@ -16,8 +16,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from esp_cli.networks.contract import Memoryless, Network
-from esp_cli.networks.io_spec import IoSpec
+from esp_cli.networks.contract import IoSpec, Memoryless, Network
 from esp_cli.networks.layers import SeedLinear, SeedMLP
 from esp_cli.networks.set_features import Rows, TeamFeatures
 from esp_cli.networks.sets import SetConfig, SetNetwork, sets_or_refuse
@@ -36,11 +35,6 @@ class SetEquivariantConfig(SetConfig):
     def build(
         self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
     ) -> Network:
-        """Build an equivariant network over sets, an invariant one of values; see `NetworkConfig.build`.
-
-        Raises:
-            UserError: an actor whose observation shows no like things, or actions that are no planar directions.
-        """
         io = sets_or_refuse(self.name, self.io_or_refuse(io))
         if io.num_values is not None:
             return SetNetwork(generators, io, outputs, self, output_gain)
@@ -54,16 +48,11 @@ class SetEquivariantConfig(SetConfig):
 
     @property
     def rows(self) -> type[Rows]:
-        """What splits the rows of such a network."""
         return InvariantRows
 
 
 def _columns(fields: Sequence[Field]) -> tuple[list[int], list[int]]:
-    """Return the columns at which vectors begin, and those of scalars, of the items of fields side by side.
-
-    Raises:
-        UserError: another kind.
-    """
+    """Return the columns at which vectors begin, and those of scalars, of the items of fields side by side."""
     vectors, scalars, start = list[int](), list[int](), 0
     for field in fields:
         if field.kind == Kind.RECORD:
@@ -108,7 +97,6 @@ class InvariantRows(Rows):
             self.widths = [width + len(of) for width, (of, _) in zip(self.widths, self.columns, strict=True)]
 
     def split(self, x: Tensor) -> tuple[Tensor, list[list[Tensor]]]:
-        """Return own invariants [S, B, d] and each family's parts [S, B, K, .] of rows x [S, B, D]."""
         own, things = self.numbers(x)
         vectors = _picked(own, self.own_columns[0])
         invariants = torch.cat([own[..., self.own_columns[1]], *_products(vectors)], -1)
@@ -134,7 +122,6 @@ def _each(x: Tensor, count: int) -> Tensor:
 
 
 def _one(field: Field) -> Field:
-    """Return a field with one item."""
     return Field(field.name, field.kind, 1, field.unit, parts=field.parts)
 
 
@@ -169,7 +156,6 @@ class DirectionActor(Memoryless):
         self.network = SetNetwork(generators, io, 1, config, output_gain, rows)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map [S, B, in] to [S, B, A]."""
         return self.network(x).unflatten(1, (x.shape[1], -1)).squeeze(-1)
 
 
@@ -192,7 +178,6 @@ class ForceActor(Memoryless):
         self.head = SeedMLP(generators, sizes, config.activation, output_gain, compiled=config.compiled is True)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map [S, B, in] to [S, B, out]."""
         parts, vectors = self._seen(x)
         lengths = (vectors.square().sum(-1) + _SMALLEST_SQUARE).sqrt()
         weights = self.head(*parts, lengths).unflatten(-1, (-1, vectors.shape[2]))

@@ -13,8 +13,7 @@ import torch
 from pydantic import Field as Setting
 from torch import Tensor, nn
 
-from esp_cli.networks.contract import ActivationName
-from esp_cli.networks.io_spec import IoSpec
+from esp_cli.networks.contract import ActivationName, IoSpec
 from esp_cli.networks.kernels.library import begin, computes
 from esp_cli.networks.kernels.sets import compiled_distances, compiled_pool
 from esp_cli.networks.layers import GAINS, SeedMLP
@@ -39,7 +38,6 @@ class SetShape(CompiledConfig, ABC):
 
     @property
     def rows(self) -> type[Rows]:
-        """What splits the rows of such a network."""
         return Rows
 
 
@@ -71,7 +69,12 @@ class Rows:
         self.families, self._near, self.compiled = layout.families, near, compiled
         self._offsets = [_place(family) for family in layout.families]
         own = [part.where.start for part in layout.own if part.field.is_point]
-        self._readers = [own[0] if own and _has_points(family) else None for family in layout.families]
+        self._readers = [
+            own[0]
+            if own and any(part.is_point for field, _ in family.parts for part in field.parts or (field,))
+            else None
+            for family in layout.families
+        ]
         located = sum(at is not None for at in self._offsets)
         each = zip(self.families, self._offsets, strict=True)
         self.widths = [family.width + (0 if at is None else 1 + located) for family, at in each]
@@ -122,11 +125,6 @@ def _place(family: Family) -> int | None:
     return min(columns)[1] if columns else None
 
 
-def _has_points(family: Family) -> bool:
-    """Return whether its things have places in the scene, and not ways to them."""
-    return any(part.is_point for field, _ in family.parts for part in field.parts or (field,))
-
-
 def _nearest(things: Tensor, ways: Tensor, count: int) -> Tensor:
     """Return the things [S, B, K, W] with the shortest ways [S, B, K, 2] to them."""
     which = ways.square().sum(-1).topk(count, -1, largest=False, sorted=False).indices
@@ -158,11 +156,6 @@ def distances_among(places: Sequence[Tensor]) -> list[Tensor]:
 
 class SetEncoder(nn.Module):
     """Features of rows that show sets.
-
-    Args:
-        generators: one CPU generator per seed, which draw the initial weights.
-        rows: splits rows.
-        config: shape.
 
     Attributes:
         width: P, features of a row.
@@ -209,13 +202,6 @@ class TeamFeatures(nn.Module):
 
     What reads all observations in a row embeds each as an agent's, and takes the agents as a set.
 
-    Args:
-        generators: one CPU generator per seed, which draw the initial weights.
-        io: of the network.
-        config: shape.
-        beside: numbers that come along with each agent, such as its action.
-        rows: split the rows, instead of those that the settings choose.
-
     Attributes:
         width: features of a row.
     """
@@ -243,11 +229,7 @@ class TeamFeatures(nn.Module):
         self.width = self.encoder.width * (not joint) + 2 * config.width * (self.agents is not None)
 
     def forward(self, x: Tensor, *beside: Tensor) -> tuple[list[Tensor], Tensor | None]:
-        """Map rows x [S, B, in], and numbers [S, B, N, .] beside agents, to features.
-
-        Returns:
-            Parts of the features of a row [S, B, .], and the features of each agent [S, B, N, H] where there are any.
-        """
+        """Map rows x [S, B, in] and numbers beside agents to features [S, B, .], and each agent's [S, B, N, H]."""
         if not self.num_agents:
             parts, sets = self.encoder(x)
             agents = sets.get(self.each)
@@ -261,11 +243,6 @@ class TeamFeatures(nn.Module):
         return [self.encoder.pool(agents)], agents
 
     def each_or_refuse(self, io: IoSpec) -> None:
-        """Refuse rows in which no agent has features of its own.
-
-        Raises:
-            UserError: it is a state that does not say which numbers are whose.
-        """
         if not (self.num_agents or self.each):
             raise UserError(
                 f"set looks at each agent by itself, but the state of {io.spaces.label} does not say which numbers are "

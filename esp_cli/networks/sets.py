@@ -17,10 +17,9 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from esp_cli.networks.contract import Memoryless, Network
-from esp_cli.networks.io_spec import IoSpec
+from esp_cli.networks.contract import IoSpec, Memoryless, Network
+from esp_cli.networks.joint_q import HYPER_GAIN
 from esp_cli.networks.layers import SeedMLP
-from esp_cli.networks.mixer import HYPER_GAIN
 from esp_cli.networks.set_features import Rows, SetShape, TeamFeatures, along
 from esp_envs.errors import UserError
 
@@ -33,26 +32,18 @@ class SetConfig(SetShape):
     def build(
         self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
     ) -> Network:
-        """Build a network over sets; see `NetworkConfig.build`.
-
-        Raises:
-            UserError: an actor whose observation shows no like things.
-        """
         io = sets_or_refuse(self.name, self.io_or_refuse(io))
         return SetNetwork(generators, io, outputs, self, output_gain)
 
     def joint_critic(
         self, generators: Sequence[torch.Generator], io: IoSpec, actions: int, further: int
     ) -> nn.Module | None:
-        """Build MADDPG's critic; see `NetworkConfig.joint_critic`."""
         return SetQ(generators, io, self, actions, further)
 
     def mixer(self, generators: Sequence[torch.Generator], io: IoSpec, width: int, further: int) -> nn.Module | None:
-        """Build QMIX's mixer; see `NetworkConfig.mixer`."""
         return SetMixer(generators, io, self, width, further)
 
     def least_parameters(self, inputs: int) -> int:
-        """Return a lower bound of the number of weights; see `NetworkConfig.least_parameters`."""
         return self.width + self.hidden[0]
 
 
@@ -91,7 +82,6 @@ class SetNetwork(Memoryless):
         self.head = SeedMLP(generators, sizes, config.activation, output_gain, compiled=config.compiled is True)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map [S, B, in] to [S, B, out]."""
         parts, agents = self.features(x)
         if not self.values_each:
             return self.head(*parts)
@@ -99,15 +89,7 @@ class SetNetwork(Memoryless):
 
 
 class SetQ(nn.Module):
-    """MADDPG's critic over the pairs (observation, action) of all agents, in whose order nothing lies.
-
-    Args:
-        generators: one CPU generator per seed, which draw the initial weights.
-        io: what it sees of a scene; a row may have further numbers behind it, such as the time.
-        config: shape.
-        actions: A, numbers of an encoded action.
-        further: numbers behind the scene.
-    """
+    """MADDPG's critic over the set of all agents' (observation, action); `further` numbers stand behind a scene."""
 
     def __init__(
         self, generators: Sequence[torch.Generator], io: IoSpec, config: SetConfig, actions: int, further: int
@@ -134,13 +116,6 @@ class SetMixer(nn.Module):
     """QMIX's mixer over a set of agents: Q_tot = w_2' elu(sum_i w_1(h_i, h) q_i + b_1) + b_2, with weights >= 0.
 
     h_i are the features of agent i and h those of the scene, so that exchanging agents changes nothing.
-
-    Args:
-        generators: one CPU generator per seed, which draw the initial weights.
-        io: what it sees of a scene; a row may have further numbers behind it, such as the time.
-        config: shape.
-        width: M, hidden units of the mixer.
-        further: numbers behind the scene.
     """
 
     def __init__(

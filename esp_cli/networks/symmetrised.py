@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
-from esp_cli.networks.contract import Network
-from esp_cli.networks.io_spec import IoSpec
+from esp_cli.networks.contract import IoSpec, Network
 from esp_cli.symmetry.maps import map_of
 from esp_cli.symmetry.representation import layout_operator
+from esp_envs.errors import UserError
+from esp_envs.spec import ActionSpace, Discrete
 
 
 class Symmetrised(Network):
-    """y = 1 / G sum_g rho_out(g)^-1 f(rho_in(g) x): equivariant whatever f is, at G times its cost.
-
-    What a recurrent f remembers of each image is kept apart.
-    """
+    """y = 1 / G sum_g rho_out(g)^-1 f(rho_in(g) x): equivariant whatever f is, at G times its cost."""
 
     def __init__(self, network: Network, io: IoSpec, group: str) -> None:
         super().__init__()
@@ -32,7 +31,6 @@ class Symmetrised(Network):
         self.register_buffer("back", torch.stack([torch.block_diag(*each) for each in matrices]), False)
 
     def _images(self, x: Tensor) -> Tensor:
-        """Return all images of rows x [S, B, D], one behind the other: [S, G * B, D]."""
         num_seeds, batch, width = x.shape
         rows = x.reshape(1, -1, width).expand(self.group.order, -1, -1)
         return self.image.push(rows).view(-1, num_seeds, batch, width).transpose(0, 1).flatten(1, 2)
@@ -56,3 +54,40 @@ class Symmetrised(Network):
         shape = (self.group.order * x.shape[1], x.shape[2])
         images = self._images(x.flatten(1, 2)).unflatten(1, shape)
         return self._mean(self.network.unroll(images, truncation).flatten(1, 2)).unflatten(1, x.shape[1:3])
+
+
+def action_parts(space: ActionSpace) -> Tensor:
+    """Return the 0/1 matrix [values of all parts, actions] of the part values that make up each action."""
+    if isinstance(space, Discrete):
+        columns = list(zip(*space.points, strict=True))
+        values = [sorted(set(column)) for column in columns]
+        if len(values) > 1 and math.prod(map(len, values)) == space.count:
+            parts = [(column, value) for column, choices in zip(columns, values, strict=True) for value in choices]
+            has = [[x == value for x in column] for column, value in parts]
+            return torch.tensor(has, dtype=torch.float32)
+    raise UserError(
+        "network.separate_parts is for discrete actions that are all combinations of part values, "
+        "such as pairs of wheel speeds; leave it off"
+    )
+
+
+class Separate(Network):
+    """y_j = sum over the parts p of action j of f(x)_p: the values (or logits) of an action's parts add up to its own.
+
+    Greedy parts make the greedy action, and a softmax of the sums is a product of one distribution per part. A
+    permutation of the parts, such as a mirror that swaps the wheels, permutes the sums.
+    """
+
+    def __init__(self, network: Network, parts: Tensor) -> None:
+        super().__init__()
+        self.network = network
+        self.memory_width = network.memory_width
+        self.parts: Tensor
+        self.register_buffer("parts", parts, False)
+
+    def step(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        y, memory = self.network.step(x, memory)
+        return y @ self.parts, memory
+
+    def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
+        return self.network.unroll(x, truncation) @ self.parts

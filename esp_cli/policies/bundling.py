@@ -15,9 +15,9 @@ from esp_cli.policies.bundled import NAME_PATTERN, Entry, Score, read_bundled, s
 from esp_cli.policies.evaluation import play_batches
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.policies.statistics import spread_over_episodes
+from esp_cli.training.build import Episodes, PolicyController
 from esp_cli.training.checkpoint import describe_policy, write_policy
 from esp_cli.training.folder_names import CONFIG
-from esp_cli.training.play import Episodes, PolicyController
 from esp_envs.errors import UserError
 
 
@@ -53,19 +53,7 @@ def bundle(
     name: str | None = None,
     force: bool = False,
 ) -> Entry:
-    """Write one seed's policy, list it in the manifest, and return its entry.
-
-    Args:
-        trained: a run.
-        folder: of the manifest; made where it is missing.
-        episodes: to choose the seed by, and as many others to score it by.
-        seed: which one; by default the best.
-        name: of the policy; by default from task, algorithm and prior.
-        force: replace a policy of the same name.
-
-    Raises:
-        UserError: an unknown seed, a name that is invalid or taken, the folder of a run, or a damaged manifest.
-    """
+    """Write one seed's policy, by default the best, list it in the folder's manifest, and return its entry."""
     config = trained.config
     name = standard_name(config.task, config.algorithm, config.prior.kind) if name is None else name
     if not re.fullmatch(NAME_PATTERN, name) or len(name) > 100:

@@ -14,9 +14,15 @@ from esp_cli.defaults import Mode, __version__
 from esp_cli.networks.policy import Policy
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.policies.statistics import EpisodeSpread, SeedSummary, spread_over_episodes, summarise
-from esp_cli.training.build import build_environment
-from esp_cli.training.play import Controller, Episodes, PolicyController, ScriptedController, play
-from esp_cli.training.streams import generators
+from esp_cli.training.build import (
+    Controller,
+    Episodes,
+    PolicyController,
+    ScriptedController,
+    build_environment,
+    generators,
+    play,
+)
 from esp_envs.errors import UserError
 
 MAX_WORLDS = 4096  # played at once, over all seeds; more episodes are played one batch after the other
@@ -50,7 +56,6 @@ class FinalEvaluation(BaseModel):
     over_episodes: dict[str, EpisodeSpread] = {}  # of each reference policy, and of one seed's greedy and stochastic
 
     def returns(self, mode: Mode) -> SeedSummary:
-        """Return the returns of the policy that acts in this way."""
         return self.greedy if mode == "greedy" else self.stochastic
 
 
@@ -122,7 +127,6 @@ def summarise_returns(returns: Tensor) -> SeedSummary:
 
 
 def _means(episodes: Episodes) -> Metrics:
-    """Return the mean of each metric over the episodes that count."""
     known = {name: value[value.isfinite()] for name, value in episodes.metrics.items()}
     return {name: float(value.mean()) for name, value in known.items() if value.numel()}
 

@@ -18,7 +18,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from esp_cli.algorithms.learner import Learner
-from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.networks.build import NETWORKS
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.policies.loading import TrainedPolicy, open_policy

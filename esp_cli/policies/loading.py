@@ -16,18 +16,17 @@ import torch
 from torch import Tensor
 
 from esp_cli.algorithms.learner import Learner, below
-from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.defaults import __version__
 from esp_cli.files.formatting import did_you_mean, shortened
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.policy import Policy
 from esp_cli.policies import bundled
-from esp_cli.training.build import spec_of
+from esp_cli.training.build import generators, spec_of
 from esp_cli.training.checkpoint import CheckpointError, read_initial, read_policy
 from esp_cli.training.config import InitialPolicy, RunConfig, resolve_task_settings
-from esp_cli.training.config_file import parse_config
 from esp_cli.training.run_folder import RunFolder
-from esp_cli.training.streams import generators
+from esp_cli.training.settings import parse_config
 from esp_envs.errors import UserError
 from esp_envs.mpe.frozen_prey import digest
 from esp_envs.registry import task_names
@@ -72,9 +71,6 @@ class TrainedPolicy:
         """Return the policy for its task under changed settings: another physics, more noise, another reward.
 
         Where the network's weights are free of counts, numbers of agents and of things may change too.
-
-        Raises:
-            UserError: an unknown setting, or one under which the policy does not see or do the same things.
         """
         if not settings:
             return self
@@ -106,10 +102,7 @@ class TrainedPolicy:
         return replace(self, config=config, spec=spec, policy=policy)
 
     def single_seed(self, seed: int | None = None) -> TrainedPolicy:
-        """Return one seed's policy, by default the first's, on the CPU and with products in float32, for export.
-
-        Products in bfloat16 only suit the machine that trained; the weights are float32 there too.
-        """
+        """Return one seed's policy, by default the first's, on the CPU and with products in float32, for export."""
         seeds = self.config.seeds
         if seed is not None and seed not in seeds:
             raise UserError(f"{self.source} has no seed {seed}; it has {', '.join(map(str, seeds))}")
@@ -169,7 +162,6 @@ class Start:
 
     @classmethod
     def open(cls, source: str | os.PathLike[str]) -> Start:
-        """Open a run folder, a policy file or a bundled policy, as `open_policy` does."""
         trained = open_policy(Path(source))
         weights = {**trained.policy.state_dict(), **trained.further}
         return cls(os.fspath(source), trained.source, trained.config, weights)
@@ -188,10 +180,7 @@ class Start:
         return cls(config.init_from.source, folder, config, weights)
 
     def fit(self, learner: Learner) -> tuple[InitialPolicy, dict[str, Tensor]]:
-        """Return what a new run's configuration records of this start, and the weights [S, ...] for its learner.
-
-        Those of a policy have to fit; those of another module are left out where they do not.
-        """
+        """Return what a new run's configuration records of this start, and the weights [S, ...] for its learner."""
         seeds, own, given = learner.policy.num_seeds, learner.policy.state_dict(), dict(self.weights)
         fitting: dict[str, Tensor] = {}
         for name, tensors in learner.further_weights().items():
@@ -277,7 +266,6 @@ def _build(
 
 
 def _stopped(meta: Mapping[str, Any], seeds: int) -> tuple[int, ...]:
-    """Return the places of stopped seeds: a checkpoint names them, a policy file has no return of theirs."""
     named, returns = meta.get("stopped_seeds"), meta.get("greedy_returns")
     if isinstance(named, Mapping):
         return tuple(k for k in range(seeds) if str(k) in named)
@@ -285,7 +273,6 @@ def _stopped(meta: Mapping[str, Any], seeds: int) -> tuple[int, ...]:
 
 
 def _fill(policy: Policy, tensors: dict[str, Tensor], path: Path, misfit: str) -> None:
-    """Put weights into a policy that was built for them."""
     for name, own in policy.state_dict().items():
         # torch would convert them silently
         if name in tensors and tensors[name].dtype != own.dtype:

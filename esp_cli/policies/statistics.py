@@ -141,10 +141,7 @@ def average_improvement(pairs: Mapping[str, tuple[ArrayLike, ArrayLike]]) -> Est
 def leader(
     ours: tuple[float, float | None, int], others: tuple[float, float | None, int]
 ) -> Literal["first", "second", "neither"] | None:
-    """Return which of two published (mean, s.e.m., number of seeds) is higher, by Welch's t-test at 5 %, if any.
-
-    None where a standard error is missing.
-    """
+    """Return which of two published (mean, s.e.m., seeds) is higher by Welch's t-test at 5 %, if any."""
     (mean, sem, count), (other, other_sem, other_count) = ours, others
     if sem is None or other_sem is None or min(count, other_count) < 2 or sem == other_sem == 0:
         return None
@@ -176,10 +173,7 @@ class Passing:
 
 
 def steps_to_threshold(steps: ArrayLike, values: ArrayLike, threshold: float) -> Passing:
-    """Return when a learning curve first is at or above a threshold; evaluations are not interpolated.
-
-    Higher is better. A value that is not finite, as of a seed that was stopped, reaches nothing.
-    """
+    """Return when a learning curve first is at or above a threshold; evaluations are not interpolated."""
     at, curves = _curves(steps, values)
     curves = np.where(np.isfinite(curves), curves, np.nan)
 
@@ -202,10 +196,7 @@ def median_steps(per_seed: Sequence[int | None]) -> tuple[float, Interval | None
 
 
 def area_under_curve(steps: ArrayLike, values: ArrayLike) -> Floats:
-    """Return each seed's mean height, integral(value) / (last step - first step) by the trapezoidal rule [S], K > 1.
-
-    A value NaN gives that seed NaN.
-    """
+    """Return each seed's mean height [S], integral(value) / (last - first step) by the trapezoidal rule, K > 1."""
     at, curves = _curves(steps, values)
     if at.size < 2:
         raise UserError("the area under a curve needs two evaluations or more")
@@ -269,7 +260,6 @@ def _iqm(values: Floats, axis: int = -1) -> Any:
 
 
 def _wins(x: Floats, y: Floats) -> Floats:
-    """Return 1 where x beats y, 1/2 where they tie, 0 elsewhere."""
     return (x > y) + 0.5 * (x == y)
 
 

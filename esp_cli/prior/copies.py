@@ -19,15 +19,7 @@ if TYPE_CHECKING:
 
 
 class Copies(Generic[Rows]):
-    """B rows for each seed and, behind them, one copy of all of them for each transform.
-
-    Args:
-        config: what the user chose of the prior.
-        originals: the rows.
-        transforms: one per copy.
-        augments: whether copies enter the learner's own loss.
-        adapt: what a learner changes in a copy that transforming alone leaves wrong.
-    """
+    """B rows for each seed and, behind them, one copy of all of them for each transform."""
 
     def __init__(
         self,
@@ -50,17 +42,14 @@ class Copies(Generic[Rows]):
 
     @cached_property
     def obs(self) -> Tensor:
-        """The observations of `rows` alone."""
         return self._pushed(self.originals.obs, lambda g: g.obs)
 
     @cached_property
     def state(self) -> Tensor:
-        """The states of `rows` alone."""
         return self._pushed(self.originals.state, lambda g: g.state)
 
     @cached_property
     def action_mask(self) -> Tensor | None:
-        """The allowed actions of `rows`."""
         mask = self.originals.action_mask
         return None if mask is None else self._pushed(mask, lambda g: g.push_outputs)
 
@@ -96,7 +85,6 @@ class Copies(Generic[Rows]):
 
     @cached_property
     def frame(self) -> Frame:
-        """The originals' frame."""
         return Frame(self.transforms)
 
     @property
@@ -105,10 +93,7 @@ class Copies(Generic[Rows]):
         return 1 + len(self.transforms) if self.augments else 1
 
     def in_frame(self, name: str) -> Tensor:
-        """Return a field of numbers per agent or per world of what is learned from: [S, 1 or 1 + copies, R].
-
-        Copies share that of their original unless the learner adapts them.
-        """
+        """Return a field of numbers per agent or per world of what is learned from: [S, 1 or 1 + copies, R]."""
         if self.adapt is None or not self.augments:
             return getattr(self.originals, name).flatten(1).unsqueeze(1)
         return self.frame.pull_values(getattr(self.rows, name)).flatten(2)
@@ -162,5 +147,4 @@ class Copies(Generic[Rows]):
 
 
 def _returned(x: Any) -> Any:
-    """Return what a network returned, a tensor among it as one that autograd knows."""
     return OfGraph(x) if isinstance(x, Tensor) else x

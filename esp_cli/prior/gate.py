@@ -114,10 +114,7 @@ class Gate:
 
 @torch.no_grad()
 def fit_gate(env: Environment, doubt: float, certain: Collection[str], alike: bool) -> Gate:
-    """Fit the predictors of a task to episodes of its worlds, half of them by the heuristic if there is one.
-
-    `alike` says whether one regression serves all agents; not where elements exchange them. The worlds are of one seed.
-    """
+    """Fit the predictors of a task to episodes of its worlds, half of them by the heuristic if there is one."""
     spaces = env.spec
     obs, action, outputs = _played(env)
     inputs = inputs_of(spaces, obs, spaces.action.admissible(action))
@@ -165,11 +162,6 @@ def inputs_of(spaces: Spaces, obs: Tensor, action: Tensor) -> Tensor:
     """Return [M, T, N, features]: 1, what each agent sees and does, products of two of these numbers, and the others'.
 
     An agent's next observation depends on what the other agents see and do.
-
-    Args:
-        spaces: what the numbers are.
-        obs: [M, T, N, D].
-        action: [M, T, N] int64, or [M, T, N, width] float32.
     """
     acted = F.one_hot(action, spaces.action.count).float()[..., 1:] if isinstance(spaces.action, Discrete) else action
     columns = torch.cat([obs, acted], -1).movedim(-1, 0).contiguous()  # [numbers, M, T, N]
@@ -206,9 +198,6 @@ def moments(inputs: Tensor, outputs: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def ridge(gram: Tensor, cross: Tensor, strength: float = 1e-4, floor: float = 1e-9) -> Tensor:
-    """Return the weights [N, F, O] of ridge regressions, of X^T X [N, F, F] and X^T Y [N, F, O].
-
-    Each feature is held back in proportion to its own square, which counts `floor` at least.
-    """
+    """Return the weights [N, F, O] of ridge regressions, of X^T X [N, F, F] and X^T Y [N, F, O]."""
     held = strength * torch.diag_embed(gram.diagonal(dim1=-2, dim2=-1).clamp_min(floor))
     return torch.linalg.solve(gram + held, cross).float()

@@ -99,7 +99,6 @@ class Loss:
 
     @torch.no_grad()
     def _evaluate(self) -> tuple[list[tuple[float, Tensor, Tensor | float | None]], list[tuple[Any, Tensor]]]:
-        """Return weights, elements and shares of all equations, and what networks returned with the slopes by it."""
         stated, sums = [], dict[int, tuple[Any, Any]]()
         for on, weight, equation in self.terms:
             _, before = sums.get(id(on), (on, None))
@@ -123,7 +122,6 @@ class Values:
         self._shape, self.count, self.rows = pulled.shape, pulled.shape[-1], pulled.flatten(2)
 
     def back(self, slope: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Return the values and the slope by them."""
         return [(self._values, self._frame.push_values(slope.view(self._shape)))]
 
 
@@ -134,7 +132,6 @@ class OfGraph:
         self.tensor, self.graph = graph.detach(), graph
 
     def back(self, slope: Tensor) -> list[tuple[OfGraph, Tensor]]:
-        """Return the slope by itself."""
         return [(self, slope)]
 
 

@@ -31,12 +31,10 @@ class SeedBatch:
 
     @property
     def tensors(self) -> dict[str, Tensor]:
-        """The fields that this batch has, by name."""
         return {name: tensor for name, tensor in vars(self).items() if tensor is not None}
 
     @property
     def count(self) -> int:
-        """B."""
         return self.obs.shape[1]
 
     @property
@@ -86,7 +84,6 @@ class SeedBatch:
 
     @classmethod
     def concatenate(cls: type[Rows], parts: Sequence[Rows]) -> Rows:
-        """Concatenate batches along the batch axis."""
         if len(parts) == 1:
             return parts[0]
         return cls(**{name: torch.cat([getattr(part, name) for part in parts], 1) for name in parts[0].tensors})
@@ -108,11 +105,7 @@ def mean_per_seed(x: Tensor, mask: Tensor | None = None) -> Tensor:
 
 
 def shares(mask: Tensor | None, shape: Sequence[int]) -> Tensor | float:
-    """Return the share of each number of x [S, P, R] in the mean of each seed over parts and over what counts.
-
-    It is a number, or [S, 1, R]; the mask is as of `mean_per_seed`. R counts B, T and one number per world or N of the
-    agents.
-    """
+    """Return the share of each number of x [S, P, R] in the mean of each seed over parts and over what counts."""
     if mask is None:
         return 1.0 / (shape[1] * shape[2])
     numbers = shape[2] // mask[0, ..., 0].numel() if mask.dim() > 3 else shape[2] // mask[0].numel()

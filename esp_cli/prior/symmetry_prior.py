@@ -30,22 +30,12 @@ class Answers(TypedDict, total=False):
 class SymmetryPrior:
     """A known symmetry of some spaces, ready for use in a learner's update.
 
-    Args:
-        config: what the user chose.
-        spaces: of the task; they decide how an element acts, and may refuse it.
-        device: where the transforms live.
-        replays: whether the learner has a replay, in which copies may be stored.
-
     Attributes:
         config: what the user chose.
         augments: whether copies of a batch enter the learner's own loss.
         transforms: the elements that copies are made with; None without a prior.
         strength: the probability with which a drawn element is used, 0 to 1; see `begin`.
         gate: says which rows are copied; whoever builds a learner that asks for one sets it.
-
-    Raises:
-        UserError: the task cannot carry an element, all copies of an infinite group are asked for, or some element
-            has no weight though trust is measured.
     """
 
     def __init__(
@@ -74,14 +64,10 @@ class SymmetryPrior:
         proportion to strength x weight, and the identity takes their place with 1 minus the largest of these. A copy by
         the identity adds nothing to a mean loss, and its consistency terms are 0: the share of copies and c fall in
         proportion, in expectation.
-
-        Args:
-            progress: share of the run that is done, 0 to 1.
         """
         self.strength = max(0.0, 1.0 - progress / self.config.fade) if self.config.fade else 1.0
 
     def _weigh(self) -> list[float]:
-        """Return the weight of each element."""
         names = self.transforms.names if self.transforms is not None else ()
         if self.config.trust == "full":
             return [1.0] * len(names)
@@ -179,7 +165,6 @@ class SymmetryPrior:
         return gated(transform, (chance < kept) | sure)
 
     def _draw(self, generators: Sequence[torch.Generator]) -> list[Transform]:
-        """Return one transform per copy, each one element per seed."""
         keep = self._keep()
         if self.transforms is None or not any(keep):
             return []

@@ -23,10 +23,10 @@ from esp_cli.studies.run_set import Cell
 from esp_cli.studies.study import Study, StudyFolder, read_evaluation
 from esp_cli.training.build import spec_of
 from esp_cli.training.config import RunConfig
-from esp_cli.training.config_file import parse_config
 from esp_cli.training.folder_names import METRICS
 from esp_cli.training.metrics import MetricsError, NoMetricError, column, elapsed_s, read_metrics
 from esp_cli.training.run_folder import RunFolder
+from esp_cli.training.settings import parse_config
 from esp_envs.errors import UserError
 from esp_envs.spec import TaskSpec
 
@@ -54,7 +54,6 @@ class RunCurve:
 
     @property
     def last_step(self) -> int:
-        """Step of the last evaluation."""
         return int(self.steps[-1])
 
     def until(self, step: int) -> RunCurve | None:
@@ -75,7 +74,6 @@ def read_curve(path: Path, label: str | None, mode: Mode) -> RunCurve:
 
 
 def _curve(rows: Sequence[Mapping[str, Any]], mode: Mode, run: Path, label: str, config: RunConfig) -> RunCurve:
-    """Return the evaluations among rows of metrics; NoMetricError where there is none yet."""
     try:
         steps, values = column(rows, f"eval/return_{mode}")
     except MetricsError as error:
@@ -100,8 +98,6 @@ class Material:
 
 @dataclass(frozen=True)
 class _State:
-    """Where the run of a cell stands."""
-
     step: int  # environment steps per seed
     curve: RunCurve | None = None  # its evaluations, if there are any yet
     final: FinalEvaluation | None = None  # of its policy, if there is one
@@ -109,17 +105,7 @@ class _State:
 
 
 def collect_study(folder: StudyFolder, mode: Mode | None = None, thresholds: Sequence[float] = ()) -> Material:
-    """Read the results of a study, finished or not.
-
-    Args:
-        folder: of the study.
-        mode: which evaluations; by default those that this kind of study reports.
-        thresholds: returns whose first passing is looked for; by default those of this kind of study, or that which
-            the cell's reference ended with.
-
-    Raises:
-        UserError: metrics or an evaluation are damaged, or have other seeds than the study.
-    """
+    """Read the results of a study, finished or not; mode and thresholds are by default those of its kind."""
     study, kind = folder.study, kind_of(folder.study.kind)
     mode = mode or kind.mode
     states = {cell.name: _state(folder, cell, mode) for cell in study.cells}
@@ -131,19 +117,7 @@ def collect_study(folder: StudyFolder, mode: Mode | None = None, thresholds: Seq
 def collect_runs(
     curves: Sequence[RunCurve], command: str, mode: Mode, at: Sequence[int] = (), thresholds: Sequence[float] = ()
 ) -> Material:
-    """Return runs of one task as a study whose panels are the steps at which they are compared.
-
-    Args:
-        curves: of the runs; the others are compared with the first.
-        command: that reports them again.
-        mode: which evaluations.
-        at: steps at which the runs are compared; by default the last step that all of them have reached.
-        thresholds: returns whose first passing is stated.
-
-    Raises:
-        UserError: a label twice, or runs of different tasks, versions or settings of the task, whose returns do not
-            compare.
-    """
+    """Return runs of one task as a study whose panels are the steps at which they are compared."""
     _refuse_unlike(curves)
     first, *_ = curves
     cells, states, by_name = [], {}, {}
@@ -196,7 +170,6 @@ def _state(folder: StudyFolder, cell: Cell, mode: Mode) -> _State:
 
 
 def _results(study: Study, states: Mapping[str, _State], mode: Mode, thresholds: Sequence[float]) -> Results:
-    """Return the results of a study whose runs stand where these states say."""
     configs = {cell.name: dict(flat(cell.config.model_dump(mode="json"))) for cell in study.cells}
     first = next(iter(configs.values()))
     shared = {key: value for key, value in first.items() if all(c.get(key, ...) == value for c in configs.values())}
@@ -211,7 +184,6 @@ def _results(study: Study, states: Mapping[str, _State], mode: Mode, thresholds:
 
 
 def _cell(study: Study, cell: Cell, state: _State, mode: Mode) -> CellResult:
-    """Return the result of a cell by its final evaluation, or at the step of comparison."""
     curve, number, kind, final = state.curve, cell.reported, kind_of(study.kind), state.final
     compared = curve.until(state.at) if curve is not None and state.at is not None else curve
     fields: dict[str, Any] = {}

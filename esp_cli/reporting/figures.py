@@ -21,8 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
-from esp_cli.files.failures import attempting
-from esp_cli.files.formatting import format_span
+from esp_cli.files.formatting import attempting, format_span
 from esp_cli.files.writing import write_file
 from esp_cli.policies.statistics import bootstrap_interval, mean_and_sem
 from esp_envs.errors import UserError
@@ -162,10 +161,7 @@ def appearance(index: int) -> tuple[str, LineStyle]:
 
 @contextmanager
 def written_figure(path: str | os.PathLike[str], size: tuple[float, float]) -> Iterator[tuple[Figure, Picture]]:
-    """Set up a figure of a size in inches and write it at the end, as PNG and as SVG.
-
-    No pyplot, so that no window and no state of the caller is touched.
-    """
+    """Set up a figure of a size in inches and write it at the end, as PNG and as SVG."""
     path = Path(path)
     stem = path.stem if path.suffix in {".png", ".svg"} else path.name
     png, svg = path.with_name(f"{stem}.png"), path.with_name(f"{stem}.svg")

@@ -7,8 +7,10 @@ import contextlib
 import csv
 import io
 import json
+import math
 import os
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -21,13 +23,13 @@ from jinja2 import Environment, FileSystemLoader
 from esp_cli.defaults import __version__
 from esp_cli.drawing.draw import Request, draw
 from esp_cli.files.documents import encode
-from esp_cli.files.formatting import escaped, format_count
+from esp_cli.files.formatting import escaped, format_count, format_interval, format_mean
 from esp_cli.files.opening import read_regular
 from esp_cli.files.writing import replace_file, write_file
 from esp_cli.policies.loading import TrainedPolicy
-from esp_cli.reporting.answer import answer
+from esp_cli.policies.statistics import steps_to_threshold
 from esp_cli.reporting.collect import Material
-from esp_cli.reporting.results import RESULTS_FORMAT
+from esp_cli.reporting.results import RESULTS_FORMAT, CellResult, Results, Side
 from esp_cli.reporting.study_figures import draw_curves, draw_variants
 from esp_cli.reporting.tables import all_tables, markdown_text
 from esp_cli.training.folder_names import POLICY
@@ -48,12 +50,7 @@ MarlEval = dict[str, dict[str, dict[str, dict[str, SeedRun]]]]  # environment ->
 
 
 def write_report(material: Material, out: Path) -> list[Path]:
-    """Write a report into a folder; return its files: page, Markdown, pictures, results and the form for marl-eval.
-
-    Raises:
-        UserError: no run has an evaluation yet, the folder has a report of something else, or a file cannot be
-            written.
-    """
+    """Write a report into a folder; return its files: page, Markdown, pictures, results and the form for marl-eval."""
     if not material.curves:
         raise UserError("no run of this study has an evaluation yet; run it first, or wait a little")
     _refuse_foreign(out)
@@ -121,11 +118,7 @@ def draw_films(runs: Mapping[str, Path], watch: Callable[[int], None]) -> None:
 
 
 def write_csv(path: Path, material: Material) -> int:
-    """Write the metrics of runs that have begun; return the number of rows.
-
-    A cell without a number is empty; a number of the whole run stands with every seed. Runs compared by hand have their
-    labels as names.
-    """
+    """Write the metrics of runs that have begun; return the number of rows."""
     runs = {cell.name if cell.at is None else cell.variant: material.runs[cell.name] for cell in material.results.cells}
     rows = [row for name, folder in runs.items() for row in _rows(name, folder)]
     names = sorted({key for row in rows for key in row} - set(_KEYS))
@@ -208,3 +201,70 @@ def _rows(name: str, folder: Path) -> Iterable[dict[str, Any]]:
 
 def _key(text: str) -> str:
     return "_".join(text.replace(",", " ").replace("=", " ").split())
+
+
+_VERDICTS: dict[Side, str] = {"ahead": "is better than", "behind": "is worse than", "level": "is not told apart from"}
+_SCALE = "where 0 is the random policy and 1 the best hand-written one"
+
+
+def answer(material: Material) -> list[str]:
+    """Return the answer: of one run beside its reference in full, of several how many are ahead."""
+    results = material.results
+    finished = [cell for cell in results.cells if cell.summary is not None and cell.summary.returns.mean is not None]
+    pairs = [(cell, other) for cell in finished if (other := results.reference_of(cell)) is not None]
+    pairs = [(cell, other) for cell, other in pairs if other in finished]
+    if len(pairs) == 1:
+        both = pairs[0]
+        return [_returns(results, *both), _verdict(*both), *_steps(material, *both)]
+    texts = _count(pairs) if pairs else [_returns(results, cell) for cell in finished[:2]]
+    if means := [f"{name} {one.mean.value:.2f}" for name, one in results.aggregates.items()]:
+        texts.append(f"Mean normalised return over all panels, {_SCALE}: {', '.join(means)}.")
+    return texts or ["No run has a return yet."]
+
+
+def _returns(results: Results, *cells: CellResult) -> str:
+    summaries = [cell.summary for cell in cells if cell.summary is not None]
+    means = [format_mean(one.returns.mean, one.returns.sem) for one in summaries]
+    ours = [f"{cell.variant} has {mean}" for cell, mean in zip(cells, means, strict=True)]
+    scores = [f"{one.normalised.mean:.2f}" for one in summaries if one.normalised is not None]
+    normalised = f"; normalised {' and '.join(scores)}, {_SCALE}" if scores else ""
+    seeds = len(cells[0].seeds)
+    what = f"{results.mode} return, {seeds} seed{'s'[: seeds - 1]}{normalised}"
+    return f"{cells[0].panel}: {' and '.join(ours)} ({what})."
+
+
+def _verdict(cell: CellResult, other: CellResult) -> str:
+    gap = None if cell.summary is None else cell.summary.gap
+    if gap is None or gap.ahead is None:
+        return "There is no interval of the difference, so this tells nothing for sure; take three seeds or more."
+    interval = f"the difference is {gap.difference.value:+.2f}, 95 % interval {format_interval(gap.difference.ci95)}"
+    return f"{cell.variant} {_VERDICTS[gap.ahead]} {other.variant}: {interval}."
+
+
+def _steps(material: Material, cell: CellResult, other: CellResult) -> list[str]:
+    """State when both mean curves first have the highest return that both of them have."""
+    curves = [material.curves[one.name] for one in (cell, other) if one.name in material.curves]
+    curves = [curve for whole in curves if (curve := whole.until(cell.at or whole.last_step)) is not None]
+    highest = [float(np.nanmax(curve.values.mean(axis=1), initial=-math.inf)) for curve in curves]
+    if len(curves) < 2 or not math.isfinite(limit := min(highest)):
+        return []
+    first = [steps_to_threshold(curve.steps, curve.values, limit).of_mean or 0 for curve in curves]
+    ours, theirs = map(format_count, first)
+    return [
+        f"The mean over seeds first has {limit:.2f} after {ours} steps of {cell.variant}, {theirs} of {other.variant}."
+    ]
+
+
+def _count(pairs: list[tuple[CellResult, CellResult]]) -> list[str]:
+    gaps = [(cell, cell.summary.gap) for cell, _ in pairs if cell.summary is not None and cell.summary.gap is not None]
+    sides = Counter(gap.ahead for _, gap in gaps)
+    counts = f"better {sides['ahead']}, not told apart {sides['level']}, worse {sides['behind']}"
+    texts = [f"Of {len(pairs)} runs beside their reference: {counts} (95 % intervals of the difference)."]
+    if gaps:
+        ordered = sorted(gaps, key=lambda pair: pair[1].difference.value)
+        largest, smallest = (
+            f"{gap.difference.value:+.2f} {format_interval(gap.difference.ci95)} ({cell.variant}; {cell.panel})"
+            for cell, gap in (ordered[-1], ordered[0])
+        )
+        texts.append(f"The largest difference is {largest}, the smallest {smallest}.")
+    return texts

@@ -128,7 +128,6 @@ class Results(BaseModel):
     aggregates: dict[str, Aggregate] = {}  # statistics over all panels by variant, where there are several panels
 
     def reference_of(self, cell: CellResult) -> CellResult | None:
-        """Return the cell that one is compared with."""
         return next((other for other in self.cells if other.name == cell.reference), None)
 
     def document(self, statistics: bool = False) -> dict[str, Any]:
@@ -138,11 +137,7 @@ class Results(BaseModel):
 
 
 def read_results(path: Path) -> Results:
-    """Read a results file.
-
-    Raises:
-        UserError: it is missing, damaged, foreign, or of a newer version.
-    """
+    """Read a results file."""
     return RESULTS_FORMAT.parse(path, Results)
 
 

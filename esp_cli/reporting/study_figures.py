@@ -62,11 +62,7 @@ def draw_curves(
     references: Mapping[str, float] | None = None,
     view: tuple[float, float] | None = None,
 ) -> tuple[Picture, tuple[Hover, ...]]:
-    """Draw the learning curves by panel, with the anchors of a run that has its final evaluation.
-
-    Runs that are compared at several steps have the same curves at each, which are drawn once. `references` are lines
-    at numbers of others, `view` the lowest and the highest return shown.
-    """
+    """Draw the learning curves by panel, with the anchors of a run that has its final evaluation."""
     entries = {entry.name: entry for entry in material.results.cells}
     panels: dict[tuple[int, ...], Panel] = {}
     for name in material.study.panels:
@@ -150,12 +146,6 @@ def learning_curves(
 ) -> tuple[Picture, tuple[Hover, ...]]:
     """Draw means over seeds with their 95 % bootstrap intervals, in panels with one legend, as in the paper's figure 4.
 
-    Args:
-        panels: at least one, each with at least one curve.
-        path: where to; ``.png`` and ``.svg`` are appended, or take the place of either.
-        ylabel: what is plotted.
-        view: lowest and highest value in view; by default all of the curves and references.
-
     Returns:
         The files, and for each panel what a page shows beside the pointer.
     """
@@ -191,7 +181,6 @@ def learning_curves(
 
 
 def _finished(results: Results) -> dict[str, dict[str, CellResult]]:
-    """Return the cells whose seeds all have a return, by panel and variant."""
     finished: dict[str, dict[str, CellResult]] = {}
     for cell in results.cells:
         if cell.returns and None not in cell.returns[results.mode]:
@@ -212,11 +201,7 @@ def _draw_curve(axes: Axes, curve: RunCurve, index: int) -> Floats:
 
 
 def _draw_levels(axes: Axes, panel: Panel, view: tuple[float, float] | None) -> None:
-    """Draw the horizontal lines in view with their names; names that would lie upon each other stand in a row.
-
-    The view ends a little below the random policy: what is worse, as the first greedy policy often is, would press the
-    rest of the curves together.
-    """
+    """Draw the horizontal lines in view with their names; names that would lie upon each other stand in a row."""
     for value in panel.references.values():
         axes.axhline(value, linestyle=(0, (8, 4)), color="#333333", linewidth=1.0, zorder=1)
     low, high = view or axes.get_ylim()

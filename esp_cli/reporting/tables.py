@@ -233,18 +233,14 @@ def table(title: str, columns: Columns[Row], rows: Iterable[Row], caption: str) 
 
 
 def _summary(cell: CellResult) -> CellSummary | None:
-    """Return the statistics of a cell of which a seed has a return."""
     return None if cell.summary is None or cell.summary.returns.mean is None else cell.summary
 
 
 def _known(text: Callable[[CellSummary], str]) -> Callable[[CellResult], str]:
-    """Return a column of the statistics of a cell, with a dash where it has none."""
     return lambda cell: NOTHING if (summary := _summary(cell)) is None else text(summary)
 
 
 def _beside(text: Callable[[Gap], str]) -> Callable[[CellResult], str]:
-    """Return a column of a cell beside its reference, empty for a reference itself."""
-
     def column(cell: CellResult) -> str:
         summary = _summary(cell)
         if summary is not None and cell.reference is None:
@@ -255,7 +251,6 @@ def _beside(text: Callable[[Gap], str]) -> Callable[[CellResult], str]:
 
 
 def _reference(results: Results) -> str:
-    """Say what runs are compared with."""
     kind = kind_of(results.kind)
     firsts = [results.config | cell.config for cell in results.cells if cell.reference is None]
     return kind.reference if all(map(_is_plain, firsts)) else kind.otherwise
@@ -268,12 +263,10 @@ def _is_plain(config: Mapping[str, JsonValue]) -> bool:
 
 
 def _share(steps: float, of: float) -> str:
-    """Return steps as a share of others, a dash where either never came."""
     return f"{steps / of:.2f}" if math.isfinite(steps) and math.isfinite(of) and of else NOTHING
 
 
 def _within(steps: float, run: int) -> str:
-    """Return a number of steps, or that it is more than a run took."""
     return format_count(steps) if math.isfinite(steps) else f"> {format_count(run)}"
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
-from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.checking.measured import planned
 from esp_cli.defaults import EPISODES, STUDY_SEEDS
 from esp_cli.files.formatting import file_name, format_exactly
@@ -41,11 +41,7 @@ class Request:
 
 
 def plan(name: str, request: Request) -> Study:
-    """Plan a study of a kind, by its name in `KINDS`.
-
-    Raises:
-        UserError: an unknown name, a setting that the study varies itself, or runs that cannot be built.
-    """
+    """Plan a study of a kind, by its name in `KINDS`."""
     kind = KINDS[name]
     cells = tuple(cell.model_copy(update={"config": planned(cell.config)}) for cell in _cells(kind, request))
     return Study(
@@ -71,7 +67,6 @@ def without_effect(name: str, request: Request) -> list[str]:
 
 
 def _cells(kind: StudyKind, request: Request) -> tuple[Cell, ...]:
-    """Return the runs of a study as the user asked for them, before anything is measured for them."""
     variants = tuple(kind.variants) if request.variants is None else tuple(request.variants)
     unknown = next((name for name in variants if name not in kind.variants), None)
     if unknown is not None or not variants or len(set(variants)) < len(variants):
@@ -89,7 +84,6 @@ def _cells(kind: StudyKind, request: Request) -> tuple[Cell, ...]:
 def _pairs(
     kind: StudyKind, task: str, algorithms: Sequence[str], variants: Sequence[str], request: Request
 ) -> Iterator[Cell]:
-    """Yield each algorithm without the prior and with it, in the rows of the paper's table."""
     teams = kind.teams or (Team(task, {}, ("table1", task)),)
     for team, steps, algorithm in (
         (team, steps, algorithm) for team in teams for steps in _steps(kind, task, request) for algorithm in algorithms
@@ -111,7 +105,6 @@ def _pairs(
 def _variants(
     kind: StudyKind, task: str, algorithms: Sequence[str], variants: Sequence[str], request: Request
 ) -> Iterator[Cell]:
-    """Yield the variants of each algorithm, which are compared with the first of them."""
     strengths = [Team(UNBROKEN if kind.breakings else "", {}, ())]
     for setting, values in kind.breakings.get(task, {}).items():
         if request.breakings is None or setting in request.breakings:
@@ -146,10 +139,7 @@ def task_setting(name: str, task: str) -> str:
 
 
 def _steps(kind: StudyKind, task: str, request: Request) -> tuple[int, ...]:
-    """Return the numbers of steps of a task.
-
-    500k and 3M name the paper's two rows (200k and 1M of formation); a number for the task itself is taken as it is.
-    """
+    """Return the numbers of steps of a task."""
     rows, names = paper.horizons(task), paper.horizons("navigation")
     if request.steps is None:
         return kind.steps or ((rows or names) if kind.all_rows else (rows or names)[:1])
@@ -161,7 +151,6 @@ def _steps(kind: StudyKind, task: str, request: Request) -> tuple[int, ...]:
 
 
 def _config(task: str, algorithm: str, steps: int, request: Request, choice: Settings, common: Settings) -> RunConfig:
-    """Resolve a run: the study's own settings, over them the user's, over them what is varied."""
     settings = dict(common)
     for name, value in request.overrides.items():
         if _concerns(name, task, algorithm):

@@ -72,11 +72,9 @@ class LocalEngine:
         self.program, self.folder = tuple(program), folder
 
     def places(self, device: str) -> int:
-        """Return one job a core, or one on this machine's GPU."""
         return 1 if device == "cuda" else available_cores()
 
     def start(self, arguments: Sequence[str], log: Path) -> LocalJob:
-        """Start the application."""
         roots = [str(Path(__file__).parents[2]), str(Path(esp_envs.__path__[0]).parent)]
         path = os.pathsep.join([*roots, *filter(None, [os.environ.get("PYTHONPATH")])])
         environment = os.environ | {
@@ -108,16 +106,13 @@ class LocalJob:
         self._process, self.log, self.pid, self.poll = process, log, process.pid, process.poll
 
     def ask_to_stop(self) -> None:
-        """Send SIGTERM."""
         self._process.send_signal(signal.SIGTERM)  # nothing where it has ended
 
     def kill(self) -> None:
-        """Send SIGKILL and wait."""
         self._process.kill()
         self._process.wait()
 
     def last_words(self) -> str:
-        """Return what its log ends with."""
         code = self.poll()
         if code is not None and code < 0:
             return f"ended by {signal.Signals(-code).name}"

@@ -24,13 +24,13 @@ from ray.exceptions import RayError, TaskCancelledError
 import esp_envs
 from esp_cli.defaults import __version__
 from esp_cli.files.documents import DocumentFormat
-from esp_cli.files.failures import sentence
+from esp_cli.files.formatting import sentence
 from esp_cli.files.opening import is_held
 from esp_cli.studies.engine import Job, LocalEngine
 from esp_cli.training.build import process_bytes, spec_of
-from esp_cli.training.config_file import parse_config
 from esp_cli.training.folder_names import LOCK
 from esp_cli.training.run_folder import RunFolder
+from esp_cli.training.settings import parse_config
 from esp_envs.errors import UserError
 from esp_envs.installed import available_cores
 
@@ -52,16 +52,7 @@ CLUSTER_FORMAT = DocumentFormat("esp-cluster", 1, "what a driver tells the nodes
 
 
 class RayEngine:
-    """Starts every job on a node of a Ray cluster.
-
-    Args:
-        folder: of the study, on a file system that all nodes share.
-        address: of the cluster; by default that of RAY_ADDRESS, or a cluster of this machine alone.
-        gpus: share of a GPU that a run on "cuda" takes.
-
-    Raises:
-        ClusterError: no cluster answers.
-    """
+    """Starts every job on a node of a Ray cluster; all nodes share the file system of the study's folder."""
 
     def __init__(self, folder: Path, address: str | None = None, gpus: float = 1.0) -> None:
         _connect(address)
@@ -80,7 +71,6 @@ class RayEngine:
         return max(1, int(have.get("GPU", 0) / self.gpus) if device == "cuda" else int(have.get("CPU", 0)))
 
     def start(self, arguments: Sequence[str], log: Path) -> RayJob:
-        """Start the application with these arguments on some node; what it prints is appended to the log."""
         run = RunFolder.open(log.parent)
         config = parse_config(run.config, run.path)
         gpus, memory = self.gpus if config.device == "cuda" else 0.0, process_bytes(config, spec_of(config))
@@ -107,7 +97,6 @@ class RayJob:
         self._words = ""
 
     def poll(self) -> int | None:
-        """Return the exit code, or None while the job runs."""
         if self._code is None and ray.wait([self._result], timeout=0)[0]:
             try:
                 self._code, self._words = ray.get(self._result)
@@ -132,17 +121,7 @@ class RayJob:
 
 
 def run_job(arguments: Sequence[str], log: Path, cluster: Path, identity: str) -> tuple[int, str]:
-    """Run the application on this node to its end; Ray's cancel asks it to stop.
-
-    Args:
-        arguments: of the command line.
-        log: file to which all that it prints is appended.
-        cluster: file in which the driver tells what a node has to know.
-        identity: that the driver wrote into this file; a node that reads another one does not share the folder.
-
-    Returns:
-        The exit code, and why it failed.
-    """
+    """Run the application on this node to its end (Ray's cancel stops it); return its exit code, and why it failed."""
     node = platform.node()
     try:
         told = CLUSTER_FORMAT.read(cluster) if cluster.is_file() else {}

@@ -15,10 +15,8 @@ from esp_cli.algorithms.learner import Learner
 from esp_cli.studies.scheduler import Status, makespan
 from esp_cli.studies.study import StudyFolder
 from esp_cli.studies.tuning import Tuning
-from esp_cli.training.build import build_environment, build_learner
+from esp_cli.training.build import PolicyController, build_environment, build_learner, generators, play
 from esp_cli.training.config import RunConfig
-from esp_cli.training.play import PolicyController, play
-from esp_cli.training.streams import generators
 from esp_envs.registry import task_class
 
 PROBE_SECONDS = 1.0  # for which iterations of a run are timed, after a first that is not
@@ -69,14 +67,7 @@ class Forecast:
 def forecast_study(
     folder: StudyFolder, others: Sequence[StudyFolder], jobs: int, listener: Callable[[int], object]
 ) -> Forecast:
-    """Measure what is left of a study, whose folder need not exist; runs that cost the same are measured once.
-
-    Args:
-        folder: of the study.
-        others: studies whose finished runs are taken over.
-        jobs: runs side by side.
-        listener: told how many runs have been looked at.
-    """
+    """Measure what is left of a study, whose folder need not exist; runs that cost the same are measured once."""
     known, runs, cells = dict[str, Cost](), list[RunForecast](), folder.study.cells
     for k, cell in enumerate(cells):
         config, step = cell.config, folder.progress(cell)[0]
@@ -101,11 +92,7 @@ def forecast_study(
 def forecast_search(
     tuning: Tuning, out: Path, seeds: Sequence[int], episodes: int, jobs: int, listener: Callable[[int], object]
 ) -> Forecast:
-    """Measure what a search costs where every trial takes as long as that of the default settings and none is pruned.
-
-    The best settings and the default ones are judged on `seeds`, in `episodes` episodes per seed; the listener is told
-    how many kinds of prior have been looked at.
-    """
+    """Measure what a search costs where all trials take as long as the default settings and none is pruned."""
     runs, trials = list[RunForecast](), tuning.budget
     for prior in tuning.priors:
         trial, last = (measure(tuning.config(prior, {}, own), episodes) for own in (tuning.trial_seeds, seeds))
@@ -139,10 +126,7 @@ def _cost(config: RunConfig, episodes: int, known: dict[str, Cost]) -> Cost:
 
 
 def measure(config: RunConfig, episodes: int) -> Cost:
-    """Measure a run by some of its iterations and an evaluation, without writing anything.
-
-    Its final evaluation has `episodes` episodes per seed.
-    """
+    """Measure a run by some of its iterations and an evaluation, without writing anything."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # as the runs of a study do
     try:

@@ -21,10 +21,7 @@ class Reported:
 
 
 def reported(key: tuple[str, ...] | None) -> Reported | None:
-    """Return a number of the paper by its place, such as ("table1", "navigation", "500000", "mappo", "esp").
-
-    None where the paper has no such number.
-    """
+    """Return a number of the paper by its place, as ("table1", "navigation", "500000", "mappo", "esp"); or None."""
     place: Any = _content()
     for part in key or ():
         place = place.get(part) if isinstance(place, dict) else None

@@ -18,10 +18,10 @@ from esp_cli.files.opening import holding, is_held
 from esp_cli.files.writing import TEMPORARY_PREFIX
 from esp_cli.studies.paper import Reported, reported
 from esp_cli.training.config import RunConfig
-from esp_cli.training.config_file import parse_config
 from esp_cli.training.folder_names import CONFIG, FRESH, LOCK, LOG, METRICS, POLICY, STUDY_LOCK
 from esp_cli.training.metrics import elapsed_s, read_last_row
 from esp_cli.training.run_folder import RunFolder
+from esp_cli.training.settings import parse_config
 from esp_envs.errors import UserError
 
 FOLDER_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
@@ -45,7 +45,6 @@ class Cell(Strict):
 
     @property
     def reported(self) -> Reported | None:
-        """The paper's number."""
         return reported(self.paper)
 
 
@@ -62,7 +61,6 @@ class RunSet(ABC):
 
     @classmethod
     def is_one(cls, path: Path) -> bool:
-        """Return whether a folder holds one."""
         return (path / cls.document).is_file()
 
     @classmethod
@@ -98,7 +96,6 @@ class RunSet(ABC):
             yield
 
     def run_path(self, cell: Cell) -> Path:
-        """Return the run folder of a cell."""
         return self.path / self.runs / cell.name
 
     def log_path(self, cell: Cell) -> Path:

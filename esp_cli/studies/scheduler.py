@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-from esp_cli.files.failures import sentence
+from esp_cli.files.formatting import sentence
 from esp_cli.files.opening import require_held
 from esp_cli.studies.engine import Engine, Job
 from esp_cli.studies.run_set import Cell, RefusedError, RunSet
@@ -55,7 +55,6 @@ class Snapshot:
     left_s: float | None  # seconds until all are trained, or None where nothing can be said yet
 
     def count(self, *statuses: Status) -> int:
-        """Return how many runs have one of these states."""
         return sum(run.status in statuses for run in self.runs)
 
 
@@ -64,14 +63,7 @@ Listener = Callable[[Snapshot], bool]
 
 
 class Scheduler:
-    """Runs the cells of a study or search side by side; the set of runs says what each of them does next.
-
-    Args:
-        folder: of the runs, held by the caller's lock.
-        cells: those that are wanted, in order.
-        jobs: at once.
-        engine: starts them.
-    """
+    """Runs the cells of a study or search side by side; the set of runs says what each of them does next."""
 
     def __init__(self, folder: RunSet, cells: Sequence[Cell], jobs: int, engine: Engine) -> None:
         self.folder, self.jobs, self.engine = folder, jobs, engine
@@ -133,7 +125,6 @@ class Scheduler:
         return steps * sum(other.trained_s / other.step for other in alike) / len(alike) if alike else None
 
     def _fill(self) -> None:
-        """Start waiting runs while there is room."""
         for run in self.runs:
             if sum(r.is_active for r in self.runs) >= self.jobs:
                 return
@@ -141,7 +132,6 @@ class Scheduler:
                 self._start(run)
 
     def _start(self, run: Run) -> None:
-        """Start the next process of a run, if anything is left to do."""
         try:
             run.cell = self.folder.begin(run.cell)
             if self._is_over(run):
@@ -180,7 +170,6 @@ class Scheduler:
             self._ended(run, code, run.job.last_words(), going)
 
     def _ended(self, run: Run, code: int, words: str, going: bool) -> None:
-        """Say where a run stands whose process has ended, and start the next one."""
         run.job, trained = None, run.status == "training" and self.folder.is_trained(run.cell)
         if self._is_over(run):
             return
@@ -190,7 +179,6 @@ class Scheduler:
             run.status, run.message = ("failed", words) if going else ("stopped", "")
 
     def _stop(self) -> None:
-        """Ask every process to stop; what waits stays as it is."""
         for run in self.runs:
             if run.job is not None:
                 run.ask_to_stop()
@@ -199,10 +187,7 @@ class Scheduler:
 
 
 def makespan(running: Sequence[float], waiting: Sequence[float], jobs: int) -> float:
-    """Return when the last job ends where each waiting one, in order, takes the first of the places that is free.
-
-    Both lists hold the seconds that each job still takes.
-    """
+    """Return when the last job ends where each waiting one, in order, takes the first of the places that is free."""
     places = sorted([*running, *[0.0] * max(0, jobs - len(running))])
     for seconds in waiting:
         places = sorted([places[0] + seconds, *places[1:]])
@@ -210,6 +195,5 @@ def makespan(running: Sequence[float], waiting: Sequence[float], jobs: int) -> f
 
 
 def _kind(run: Run) -> tuple[object, ...]:
-    """Return what decides the speed of a run most."""
     config = run.cell.config
     return config.task, config.algorithm, config.network.name, len(config.seeds)

@@ -45,16 +45,9 @@ _SEED = 0
 class Search(RunSet):
     """The folder of a search, whose runs are its trials: those of all priors in turn, each prior with the same budget.
 
-    Args:
-        path: the folder, held by the caller's lock.
-        tuning: what is asked for.
-
     Attributes:
         cells: of all trials. The settings of one are proposed when it begins; until then it has the default ones.
         studies: of Optuna, by prior.
-
-    Raises:
-        StudyError: its journal is damaged, or no search with this space wrote it.
     """
 
     document, runs, noun = TUNING, "trials", "tuning"
@@ -131,7 +124,6 @@ class Search(RunSet):
                 )
 
     def _defaults(self, prior: str) -> dict[str, object]:
-        """Return the default settings, as far as they are in the space."""
         config = self.tuning.config(prior, {}).model_dump(mode="json")
         sections = {"task": "task_settings", self.tuning.algorithm: "algorithm_settings"}
         found = {}
@@ -145,7 +137,6 @@ class Search(RunSet):
         return Cell(name=name, panel=prior, variant=name, config=self.tuning.config(prior, settings))
 
     def trials(self, prior: str) -> Sequence[Any]:
-        """Return the trials of a prior, by number."""
         return self.studies[prior].get_trials(deepcopy=False)
 
     def trial(self, prior: str, number: int) -> Any:
@@ -159,12 +150,10 @@ class Search(RunSet):
         return trial
 
     def _settings(self, prior: str, trial: Any) -> dict[str, object]:
-        """Return the settings of a trial; those that it does not have yet are proposed."""
         drawn = {name: trial._suggest(name, _distribution(d)) for name, d in self._spaces[prior].items()}
         return {name: parse_value(v) if isinstance(v, str) else v for name, v in drawn.items()}  # choices are JSON
 
     def is_finished(self, cell: Cell) -> bool:
-        """Return whether the record has the end of a trial."""
         prior, number = self._keys[cell.name]
         known = self.trials(prior)
         return number < len(known) and known[number].state.is_finished()
@@ -200,10 +189,7 @@ class Search(RunSet):
         return False
 
     def keeps_up(self, trial: Any, points: Sequence[Point]) -> bool:
-        """Record evaluations of a trial that are not recorded yet; return whether the trial may go on after each.
-
-        The first trial may always go on, and so may one that has all its steps.
-        """
+        """Record evaluations of a trial that are not recorded yet; return whether the trial may go on after each."""
         known = trial.study.get_trials(deepcopy=False)[trial.number].last_step
         for point in points:
             resource = int(point.seconds) if self.tuning.goal == "seconds" else point.step
@@ -220,7 +206,6 @@ class Search(RunSet):
             remove_file(file)
 
     def outcome(self, prior: str) -> Outcome:
-        """Return what came out for one prior."""
         trials, tuning = self.trials(prior), self.tuning
         done = [t for t in trials if t.state == TrialState.COMPLETE]
         best = max(done, key=lambda t: (t.value, -t.number), default=None)
@@ -256,7 +241,6 @@ class Search(RunSet):
 
 
 def _distribution(dimension: Dimension) -> BaseDistribution:
-    """Return what Optuna draws the values of a setting from; choices as JSON."""
     if dimension.choices is not None:
         return CategoricalDistribution([json.dumps(value) for value in dimension.choices])
     low, high = dimension.low or 0, dimension.high or 0
@@ -264,7 +248,6 @@ def _distribution(dimension: Dimension) -> BaseDistribution:
 
 
 def _is_sound(trial: Any, space: Mapping[str, BaseDistribution]) -> bool:
-    """Return whether a search of this space can have left a trial."""
     ended, names = trial.state in (TrialState.COMPLETE, TrialState.PRUNED), trial.params.keys()
     if (names != space.keys() if ended else names - space.keys()) or trial.state == TrialState.FAIL:
         return False

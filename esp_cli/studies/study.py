@@ -57,7 +57,6 @@ class Study(Strict):
 
     @property
     def panels(self) -> list[str]:
-        """The panels in order."""
         return list(dict.fromkeys(cell.panel for cell in self.cells))
 
 
@@ -97,13 +96,7 @@ class StudyFolder(RunSet):
 
     @classmethod
     def planned(cls, path: Path, study: Study) -> tuple[StudyFolder, bool]:
-        """Return what `create` makes of a study, and whether that differs from what is there; writes nothing.
-
-        A cell that the folder has keeps its run, and may be compared with another one than before.
-
-        Raises:
-            StudyError: the folder holds another study, a run under other rules of its task, or something foreign.
-        """
+        """Return what `create` makes of a study, and whether that differs from what is there; writes nothing."""
         # As JSON shows it, so that it equals what is read again: a tuple in a task's settings becomes a list.
         study = Study.model_validate_json(study.model_dump_json())
         cls.refuse_foreign(path)
@@ -153,16 +146,13 @@ class StudyFolder(RunSet):
         return self.run_path(cell) / FINAL
 
     def is_finished(self, cell: Cell) -> bool:
-        """Return whether a cell is trained, and its policy evaluated."""
         return self.is_trained(cell) and read_evaluation(self.run_path(cell)) is not None
 
     def begin(self, cell: Cell) -> Cell:
-        """Make the run folder of a cell; return the cell."""
         self.prepare(cell)
         return cell
 
     def goes_on(self, cell: Cell) -> bool:
-        """Return whether anything is left to do for a cell."""
         return not self.is_finished(cell)
 
     def end(self, cell: Cell) -> None:
@@ -198,10 +188,7 @@ class StudyFolder(RunSet):
         return twins
 
     def find_twin(self, cell: Cell, others: Sequence[StudyFolder]) -> Path | None:
-        """Return the folder of a finished run of the same configuration and number of episodes in other studies.
-
-        None where there is none for this version of the task, or where the cell's own run has begun.
-        """
+        """Return the folder of a finished run of the same configuration and number of episodes in other studies."""
         if self.run_path(cell).exists():
             return None
         alike = (
@@ -241,5 +228,4 @@ def read_evaluation(run: Path) -> FinalEvaluation | None:
 
 
 def _task_version(config: RunConfig) -> int:
-    """Return the version of the rules of a run's task."""
     return make(config.task, 1, (0,), config.task_settings).spec.version

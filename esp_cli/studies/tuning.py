@@ -64,12 +64,7 @@ class Tuning(Strict):
         return frozenset.intersection(*(config.without_effect() for config in configs))
 
     def check(self, seeds: Sequence[int]) -> None:
-        """Refuse what cannot be run; `seeds` are those of the runs that judge the best settings.
-
-        Raises:
-            UserError: a trial has one of the seeds, a setting of the space is unknown, refuses a value, is not the
-                learner's or changes nothing, nothing is left to search, or the goal lacks its return.
-        """
+        """Refuse what cannot be run; `seeds` are those of the runs that judge the best settings."""
         shared = set(seeds) & set(self.trial_seeds)
         if shared:
             raise UserError(f"seed {min(shared)} belongs to the trials; choose --seeds that no trial has")
@@ -152,10 +147,7 @@ def curve_of(metrics: Path) -> list[Point]:
 
 
 def score(curve: Sequence[Point], tuning: Tuning) -> float | None:
-    """Return the score of a curve, the larger the better; None where it has none: it did not reach the return.
-
-    Steps and seconds count as negative numbers.
-    """
+    """Return the score of a curve, the larger the better (steps and seconds negative); None if it missed the return."""
     if tuning.goal == "return":
         return curve[-1].value if curve and math.isfinite(curve[-1].value) else None
     first = next((p for p in curve if tuning.reach is not None and p.mean >= tuning.reach), None)

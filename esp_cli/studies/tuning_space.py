@@ -44,14 +44,10 @@ class Dimension(Strict):
 
     @property
     def is_whole(self) -> bool:
-        """Whether the values are whole numbers."""
         return isinstance(self.low, int) and isinstance(self.high, int)
 
     def corners(self) -> tuple[JsonValue, ...]:
-        """Return the values that show whether the setting takes all of them: all choices, or both ends.
-
-        Of a range with fractions also one between, which is no whole number.
-        """
+        """Return values that show whether the setting takes all: its choices, or both ends, and a fraction between."""
         if self.choices is not None:
             return self.choices
         assert self.low is not None

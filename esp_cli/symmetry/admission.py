@@ -30,10 +30,7 @@ PLANE_GROUPS = ("c2", "d2", "c4", "d4", "c8", "d8", "so2", "o2")
 
 
 def admitted_elements(text: str, spaces: Spaces, instead: str = "") -> tuple[Element, ...] | Group:
-    """Read transforms from text (see `parse_elements`) and refuse what the task cannot carry (see `admit`).
-
-    What was discovered ("discovered:flip-x") need not be declared: actions and layouts alone have to carry it.
-    """
+    """Read transforms from text (see `parse_elements`) and refuse what the task cannot carry (see `admit`)."""
     found = text.removeprefix(DISCOVERED)
     if not found and text:
         raise UserError("nothing was discovered that transforms could name; choose some, or no prior")
@@ -69,11 +66,7 @@ def admit(text: str, elements: Sequence[Element] | Group, spaces: Spaces, instea
 
 
 def admit_declared(spaces: Spaces) -> None:
-    """Refuse the symmetry that a task declares, or declares nearly, where its actions or layouts cannot carry it.
-
-    Raises:
-        UserError: they cannot, or it means nothing.
-    """
+    """Refuse the symmetry that a task declares, or declares nearly, where its actions or layouts cannot carry it."""
     for text in filter(None, (spaces.symmetry, spaces.nearly)):
         declared = replace(spaces, symmetry=text, nearly="")
         for name in _factors(declared):
@@ -81,10 +74,7 @@ def admit_declared(spaces: Spaces) -> None:
 
 
 def carried_groups(spaces: Spaces) -> tuple[str, ...]:
-    """Return the named groups that a task's actions and declared symmetry both carry, the largest planar one last.
-
-    `agents` follows if the agents of the task may change places, then orders of items that it declares.
-    """
+    """Return the named groups that a task's actions and declared symmetry both carry, the largest planar one last."""
     agents = [AGENTS] if spaces.num_agents > 1 else []
     scene = scene_of(_usable(spaces), spaces.num_agents)
     names = dict.fromkeys([*PLANE_GROUPS, scene, *agents, *_factors(spaces)])
@@ -101,9 +91,6 @@ def default_transforms(spaces: Spaces, weighed: bool = False) -> str:
         spaces: of the task.
         weighed: whether each element counts by how nearly it holds, so that nothing has to be declared: then d4
             wherever actions and layouts carry it, and such orders, or elements coupled with some, beside it.
-
-    Raises:
-        UserError: its symmetry means nothing.
     """
     declared = _factors(spaces)
     listed = [name for name in declared[:1] if name != "so2"]
@@ -170,11 +157,7 @@ def under_a_compass(spaces: Spaces) -> Spaces:
 
 
 def declares(symmetry: str, num_agents: int) -> Callable[[Element], bool]:
-    """Return what says whether a declared symmetry holds an element.
-
-    Raises:
-        UserError: the symmetry means nothing.
-    """
+    """Return what says whether a declared symmetry holds an element."""
     if symmetry == _ANYTHING:
         return lambda _: True
     group = ProductGroup(*_declared(symmetry, num_agents))
@@ -189,7 +172,6 @@ def _carries(name: str, spaces: Spaces) -> bool:
 
 
 def _reason(check: Callable[..., object], *args: object) -> str | None:
-    """Return why a check refuses its arguments, if it does."""
     try:
         check(*args)
     except UserError as error:
@@ -198,7 +180,6 @@ def _reason(check: Callable[..., object], *args: object) -> str | None:
 
 
 def _require(elements: Sequence[Element], spaces: Spaces) -> None:
-    """Refuse elements that a task cannot carry: actions first, then the scene, layouts and orders."""
     scenes = tuple(dict.fromkeys(element.in_place for element in elements))
     declared = declares(_usable(spaces), spaces.num_agents)
     undeclared = [element for element in elements if not declared(element)]

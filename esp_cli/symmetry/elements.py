@@ -176,7 +176,6 @@ def _moves(order: Order) -> bool:
 
 
 def _composed(g: Order | None, h: Order | None) -> Order | None:
-    """Return the order that applies h first, then g; None moves nothing."""
     if g is None or h is None:
         return g or h
     if len(g) != len(h):

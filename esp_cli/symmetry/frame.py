@@ -44,10 +44,7 @@ class Frame:
         return self._each(parts, lambda g: g.pull_back_variance).round().long()
 
     def orders(self, num_actions: int) -> Tensor | None:
-        """Return which output of each part is the original's action [S or 1, 1 + K, A].
-
-        None where copies differ in more than the order of the outputs of an agent.
-        """
+        """Return which output of each part is the original's action [S or 1, 1 + K, A]."""
         maps = [g.output_map for g in self._transforms if type(g) is Transform]
         backs = [m.back for m in maps if isinstance(m, Gather) and m.sign is None]
         if self._moves_agents or len(backs) < len(self._transforms):

@@ -61,11 +61,7 @@ class FiniteGroup(Group):
 
     @classmethod
     def generated_by(cls, name: str, generators: Iterable[Element | Geometry]) -> FiniteGroup:
-        """Build the smallest group that holds the generators.
-
-        Raises:
-            UserError: it has more than `LISTED_LIMIT` elements.
-        """
+        """Build the smallest group that holds the generators, of at most `LISTED_LIMIT` elements."""
         gens = tuple(map(Element.of, generators))
         found, frontier = {Element()}, [Element()]
         while frontier:
@@ -78,7 +74,6 @@ class FiniteGroup(Group):
 
     @property
     def order(self) -> int:
-        """G, the number of elements."""
         return len(self.elements)
 
     @cached_property
@@ -143,11 +138,7 @@ def swap_and_round(count: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
 
 @lru_cache(maxsize=16)
 def agent_permutations(num_agents: int) -> Group:
-    """Return S_N: listed up to `LISTED_LIMIT` orders, sampled beyond.
-
-    Raises:
-        UserError: fewer than two agents.
-    """
+    """Return S_N: listed up to `LISTED_LIMIT` orders, sampled beyond."""
     if num_agents < 2:
         raise UserError("agents can only change places where there are two or more; choose a planar group")
     if math.factorial(num_agents) > LISTED_LIMIT:
@@ -156,11 +147,7 @@ def agent_permutations(num_agents: int) -> Group:
 
 
 def item_orders(field: str, count: int) -> FiniteGroup:
-    """Return all orders of a field's items.
-
-    Raises:
-        UserError: fewer than 2 items, or more than `MOST_ITEMS`.
-    """
+    """Return all orders of a field's items."""
     if not 2 <= count <= MOST_ITEMS:
         raise UserError(f"{count} {field} have no group of orders; 2 to {MOST_ITEMS} like items of a field have one")
     return FiniteGroup(f"{field}-{count}", (Element(items=((field, p),)) for p in permutations(range(count))))

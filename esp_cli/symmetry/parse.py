@@ -62,9 +62,6 @@ def parse_group(text: str, num_agents: int) -> Group:
 
     Factors that act on different things make up their direct product. A comma, or factors that act on a common thing,
     stand for all that they generate together.
-
-    Raises:
-        UserError: an unknown name, or generators of more than `LISTED_LIMIT` elements.
     """
     return direct_product(*declared_factors(text, num_agents))
 
@@ -113,7 +110,6 @@ def _moves_scene(group: Group) -> bool:
 
 
 def _item(part: str, text: str, num_agents: int) -> tuple[Element, ...] | Group:
-    """Read one entry of the list: a tuple of elements, or a group that has to be sampled."""
     factors = [_factor(word.strip(), text, num_agents) for word in part.split("*")]
     groups = [factor for factor in factors if isinstance(factor, Group)]
     if len(groups) == len(factors):
@@ -167,7 +163,6 @@ READERS: list[Callable[[str, int], Element | Geometry | Group | None]] = [read_p
 
 
 def _read_items(word: str) -> Element | Group | None:
-    """Read an order of a field's items, or all orders."""
     if not (match := re.fullmatch(_ORDER, word)):
         return None
     count = match[2].count("-")
@@ -178,7 +173,6 @@ def _read_items(word: str) -> Element | Group | None:
 
 
 def _order(word: str, count: int) -> tuple[int, ...]:
-    """Read the place that each of some things moves to: "agents-1-0-2"."""
     name, *numbers = word.split("-")
     places = tuple(map(int, numbers))
     if sorted(places) != list(range(count)):

@@ -55,7 +55,6 @@ class PlaneElement(Geometry):
 
     @property
     def degrees(self) -> Fraction:
-        """The turn in degrees."""
         return self.turn * 360
 
     @property
@@ -138,10 +137,7 @@ A kind that turns and mirrors leave alone, such as one of another geometry, says
 
 
 def picture_sources(pixels: tuple[int, int], planar: Floats) -> Indices:
-    """Return [rows * columns]: the index of the old pixel that shows in each pixel of a transformed picture.
-
-    A pixel's place is its middle's (x, y), seen from the picture's: the first row is the top, the first column left.
-    """
+    """Return [rows * columns]: the index of the old pixel that shows in each pixel of a transformed picture."""
     rows, columns = pixels
     row, column = np.divmod(np.arange(rows * columns), columns)
     place = np.stack([column - (columns - 1) / 2, (rows - 1) / 2 - row], -1)
@@ -154,10 +150,7 @@ def picture_sources(pixels: tuple[int, int], planar: Floats) -> Indices:
 
 
 def ring_sources(rays: int, planar: Floats) -> Indices:
-    """Return [rays]: the index of the old ray that shows in each ray of a transformed ring.
-
-    Ray k points at k / rays of a turn, counter-clockwise from the x-axis.
-    """
+    """Return [rays]: the index of the old ray that shows in each ray of a transformed ring."""
     angle = 2 * np.pi * np.arange(rays) / rays
     origin = np.stack([np.cos(angle), np.sin(angle)], -1) @ planar  # the inverse is the transpose
     old = np.arctan2(origin[:, 1], origin[:, 0]) * rays / (2 * np.pi)

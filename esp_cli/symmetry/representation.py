@@ -21,10 +21,7 @@ _MATCH_TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class Operator:
-    """A linear map of rows of D numbers for each of G elements: new[k] = sum_j weight[k, j] old[source[k, j]].
-
-    It is sparse, so that a permutation of the pixels of a picture is no matrix of their square.
-    """
+    """A linear map of rows of D numbers for each of G elements: new[k] = sum_j weight[k, j] old[source[k, j]]."""
 
     source: Indices  # [G, D, m] int64; a new number is made of m old ones
     weight: Floats  # [G, D, m]
@@ -61,12 +58,10 @@ class Operator:
 
     @property
     def width(self) -> int:
-        """D."""
         return self.source.shape[1]
 
     @property
     def matrix(self) -> Floats:
-        """The same as matrices [G, D, D]."""
         out = np.zeros((len(self.source), self.width, self.width))
         elements, rows = np.arange(len(self.source))[:, None, None], np.arange(self.width)[:, None]
         np.add.at(out, (elements, rows, self.source), self.weight)
@@ -92,7 +87,6 @@ class Operator:
         return Operator.beside([self] * count, len(self.source))
 
     def selected(self, index: Sequence[int]) -> Operator:
-        """Return the operators at some places of the stack."""
         return Operator(self.source[index], self.weight[index])
 
 
@@ -107,10 +101,7 @@ def rows_operator(layout: Layout, elements: Sequence[Element], num_agents: int) 
 
 
 def state_operator(spaces: Spaces, elements: Sequence[Element]) -> Operator:
-    """Return L_g of the global state of Ds numbers.
-
-    A joint state (`Spaces.is_joint`) moves like the joint observation; any other moves its AGENTS items.
-    """
+    """Return L_g of the global state of Ds numbers."""
     places = agent_places(elements, spaces.num_agents)
     if places is not None and spaces.is_joint:
         return rows_operator(spaces.observation, elements, spaces.num_agents)
@@ -180,7 +171,6 @@ def item_operator(field: Field, elements: Sequence[Element]) -> Operator:
 
 
 def _item_operator(field: Field, geometry: tuple[Geometry, ...]) -> Operator:
-    """Return how one item transforms under one of each kind of geometry, G = 1."""
     whole = Operator.reordering(np.arange(field.item_width)[None])
     for one in geometry:
         part = Operator.of_block(one.block(field))

@@ -157,11 +157,7 @@ class Transform:
 def build_transform(
     elements: Sequence[Element], spaces: Spaces, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
 ) -> Transform:
-    """Stack the representations of some elements, one per seed, on a task's spaces.
-
-    Raises:
-        UserError: no element, or the task's actions or layouts cannot carry one.
-    """
+    """Stack the representations of some elements, one per seed, on a task's spaces."""
     if not elements:
         raise UserError("a transform needs one element per seed, got none")
     require_items(elements, spaces)
@@ -253,18 +249,13 @@ class TransformSet:
         return self._picked([index if _stays(strength, g) else self.size for g in generators])
 
     def _picked(self, picks: Sequence[int]) -> Transform:
-        """Return the elements at these places, one per seed; the place behind the last is the identity."""
         if self._stack is None:
             elements = (*self._elements, Element())
             return self._build([elements[i] for i in picks])
         return self._single(*picks) if len(picks) == 1 else self._stack.select(picks)
 
     def each(self) -> list[Transform]:
-        """Return every element in order, each the same for all seeds.
-
-        Raises:
-            UserError: the group is sampled.
-        """
+        """Return every element of a finite group in order, each the same for all seeds."""
         if not self.is_finite:
             raise UserError(f"{self.names[0]} cannot be listed; draw from it or choose a finite group")
         if self._stack is not None:
@@ -272,7 +263,6 @@ class TransformSet:
         return [self._build([e]) for e in self._elements]
 
     def _single(self, index: int) -> Transform:
-        """Return one element of the stack, selected once."""
         assert self._stack is not None
         if index not in self._singles:
             self._singles[index] = self._stack.select([index])
@@ -288,13 +278,9 @@ def transform_set(
     """Read transforms from text (see `parse_elements`) and build them for a task.
 
     transform_set("d4", spec).draw([torch.Generator()]).obs(obs)
-
-    Raises:
-        UserError: the text means nothing, or the task cannot carry what it means.
     """
     return TransformSet(admitted_elements(text, spaces), spaces, device, dtype)
 
 
 def _stays(strength: float, generator: torch.Generator) -> bool:
-    """Draw whether an element stays; nothing is drawn where it is certain."""
     return strength >= 1 or float(torch.rand((), generator=generator)) < strength

@@ -3,26 +3,45 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
 import time
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from esp_cli.algorithms.learner import Learner, LearnerConfig
-from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.algorithms.presets import ALGORITHMS
+from esp_cli.networks.policy import Policy
 from esp_cli.prior.config import PriorConfig
 from esp_cli.prior.gate import fit_gate
 from esp_cli.training.config import RunConfig
-from esp_cli.training.streams import generators, stream_seeds
-from esp_envs.base import Environment
+from esp_envs.base import Environment, Observation
 from esp_envs.compass import Compass
 from esp_envs.conformance import QUICK, Subject, check
 from esp_envs.errors import UserError
 from esp_envs.registry import TASKS, make
 from esp_envs.spec import TaskSpec
+
+
+def stream_seed(seed: int, *names: object) -> int:
+    """Return a 63-bit seed that depends on the run seed and the stream's names alone."""
+    text = "/".join(str(part) for part in (seed, *names))
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "little") >> 1
+
+
+def stream_seeds(seeds: Sequence[int], *names: object) -> list[int]:
+    """Return the stream's seed for each run seed."""
+    return [stream_seed(seed, *names) for seed in seeds]
+
+
+def generators(seeds: Sequence[int], *names: object) -> list[torch.Generator]:
+    """Return one CPU generator per run seed for the named stream."""
+    return [torch.Generator().manual_seed(seed) for seed in stream_seeds(seeds, *names)]
+
 
 _LOOK_SECONDS = 2.0  # at a task of others before it is trained on
 _GATE_WORLDS = 256  # for the episodes that a gate's predictors are fitted to
@@ -66,11 +85,7 @@ def spec_of(config: RunConfig) -> TaskSpec:
 
 
 def build_learner(config: RunConfig) -> Learner:
-    """Build the learner of a run, with its worlds.
-
-    Raises:
-        UserError: parts of the configuration do not go together, or it needs more memory than the machine has.
-    """
+    """Build the learner of a run, with its worlds."""
     cls = ALGORITHMS[config.algorithm]
     settings = cls.config_class(**config.algorithm_settings)
     refuse_what_does_not_fit(config, settings, spec_of(config))
@@ -146,3 +161,74 @@ def machine_bytes(device: str) -> int:
 
 def _gigabytes(size: int) -> str:
     return f"{size / 1e9:,.1f} GB"
+
+
+class PolicyController:
+    """S trained policies, which draw their actions with a generator per seed, or without any act greedily."""
+
+    def __init__(self, policy: Policy, generators: Sequence[torch.Generator] | None = None) -> None:
+        self.policy, self.generators = policy, generators
+
+    def begin(self, env: Environment, observation: Observation) -> None:
+        self.memory = self.policy.initial_memory(env.num_envs, observation.obs)
+
+    def act(self, env: Environment, observation: Observation) -> Tensor:
+        """Return the greedy or a drawn action, as `Environment.step` takes it."""
+        noise = None
+        if self.generators is not None:
+            shape = (env.num_envs, env.spec.num_agents)
+            noise = self.policy.head.noise(shape, self.generators).to(env.device)
+        action, self.memory = self.policy.act(observation.obs, self.memory, noise, observation.action_mask)
+        return action
+
+
+class ScriptedController:
+    """A policy of the task itself, such as its random one or a heuristic, as a function of the environment.
+
+    Example:
+        >>> play(env, ScriptedController(methodcaller("heuristic"))).returns
+    """
+
+    def __init__(self, choose: Callable[[Environment], Tensor]) -> None:
+        self._choose = choose
+
+    def begin(self, env: Environment, observation: Observation) -> None:
+        """Prepare nothing."""
+
+    def act(self, env: Environment, observation: Observation) -> Tensor:
+        return self._choose(env)
+
+
+Controller = PolicyController | ScriptedController  # chooses joint actions
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """What one episode in every world brought."""
+
+    returns: Tensor  # [S, E] mean over agents of the sum of rewards over time
+    lengths: Tensor  # [S, E] steps
+    metrics: dict[str, Tensor]  # task measures, each [S, E]: means over the episode's steps or sums, as the spec says
+
+
+@torch.no_grad()
+def play(env: Environment, controller: Controller) -> Episodes:
+    """Play one episode in every world and add up what it brings; later episodes of a world do not count."""
+    observation = env.reset()
+    controller.begin(env, observation)
+    shape = (env.num_seeds, env.num_envs)
+    running = torch.ones(shape, dtype=torch.bool, device=env.device)
+    returns, lengths = torch.zeros(shape, device=env.device), torch.zeros(shape, device=env.device)
+    sums: dict[str, Tensor] = {}
+    for _ in range(env.spec.horizon):
+        step = env.step(controller.act(env, observation))
+        returns += torch.where(running, step.reward.mean(-1), 0.0)
+        lengths += running
+        for name, value in step.metrics.items():
+            sums[name] = sums.get(name, 0.0) + torch.where(running, value, 0.0)
+        running &= ~step.ended
+        observation = step.next
+        if env.spec.terminates and not running.any():
+            break
+    means = {name: value if name in env.spec.totals else value / lengths for name, value in sums.items()}
+    return Episodes(returns, lengths, means)

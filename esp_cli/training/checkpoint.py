@@ -27,8 +27,7 @@ from torch import Tensor
 
 from esp_cli.defaults import __version__
 from esp_cli.files.documents import DocumentError, parse_object
-from esp_cli.files.failures import attempting
-from esp_cli.files.formatting import shortened
+from esp_cli.files.formatting import attempting, shortened
 from esp_cli.files.opening import open_regular
 from esp_cli.files.writing import replace_file
 from esp_cli.training.config import InitialPolicy, RunConfig
@@ -59,14 +58,7 @@ def save_checkpoint(
     meta: Mapping[str, Any],
     format_name: str = CHECKPOINT_FORMAT,
 ) -> None:
-    """Write tensors and their description atomically, into a folder that exists.
-
-    Args:
-        path: of the file.
-        tensors: dense tensors by name, on any device, float, integer or bool. Generator states are uint8 tensors.
-        meta: JSON-able description. The keys ``format``, ``version`` and ``sha256`` are the container's own.
-        format_name: kind of file, asked for again when it is loaded.
-    """
+    """Write dense tensors by name, on any device, and a JSON-able description atomically, into a folder that exists."""
     if taken := sorted(_RESERVED & meta.keys()):
         raise CheckpointError(f"cannot write {path}: the description may not use the reserved key '{taken[0]}'")
     try:
@@ -88,11 +80,7 @@ def load_checkpoint(
     format_name: str = CHECKPOINT_FORMAT,
     sha256: str | None = None,
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read and verify what `save_checkpoint` wrote, and a SHA-256 of the whole file where a manifest states one.
-
-    Returns:
-        The tensors by name, on the CPU, and the description without the container's own keys.
-    """
+    """Read and verify what `save_checkpoint` wrote, and a SHA-256 of the whole file where a manifest states one."""
     with _naming(path):
         header, content = _read(Path(path))
         if sha256 is not None and hashlib.sha256(content).hexdigest() != sha256:
@@ -119,7 +107,6 @@ def read_description(path: str | os.PathLike[str], format_name: str = CHECKPOINT
 
 @contextlib.contextmanager
 def _naming(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Put the name of the file before what is wrong with it."""
     try:
         yield
     except (CheckpointError, DocumentError) as error:
@@ -129,7 +116,6 @@ def _naming(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def _storable(path: str | os.PathLike[str], tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the tensors as dense contiguous ones on the CPU, no two of which share memory."""
     stored: dict[str, Tensor] = {}
     storages: set[int] = set()
     for name, tensor in tensors.items():
@@ -204,7 +190,6 @@ def _description(header: Mapping[str, Any], format_name: str) -> dict[str, Any]:
 
 
 def _check_tensors(tensors: Mapping[str, Tensor]) -> None:
-    """Check what the loader lets pass and `save_checkpoint` never writes."""
     for name, tensor in tensors.items():
         if tensor.dtype not in _DTYPES or tensor.dim() > _MAX_DIMENSIONS:
             raise CheckpointError(f"is damaged: its tensor {shortened(repr(name))} has another dtype or rank than any")
@@ -231,10 +216,7 @@ def read_policy(path: str | os.PathLike[str], sha256: str | None = None) -> tupl
 
 
 def describe_policy(config: RunConfig, spec: TaskSpec, step: int, returns: Sequence[float]) -> dict[str, Any]:
-    """Return the description by which a policy file is used without its run folder.
-
-    `returns` are of greedy episodes, one per seed, NaN where it stopped; `step` is per seed.
-    """
+    """Return the description by which a policy file is used without its run folder."""
     return {
         "task": config.task,
         "task_version": spec.version,

@@ -11,8 +11,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, Field, field_validator
 from pydantic_core import to_jsonable_python
 
-from esp_cli.algorithms.presets import preset_layers
-from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.algorithms.presets import ALGORITHMS, preset_layers
 from esp_cli.defaults import MAX_SEEDS, MAX_STEPS, STEPS
 from esp_cli.files.documents import Strict, parse_value, validated
 from esp_cli.files.formatting import nearest, shortened
@@ -199,7 +198,6 @@ def _override(
 
 
 def _no_section(dotted: str, task: str, algorithm: str) -> str:
-    """Say that a name is not SECTION.NAME, and which setting is like it."""
     models: dict[str, type[BaseModel]] = {
         "task": task_class(task).Settings,
         algorithm: ALGORITHMS[algorithm].config_class,
@@ -214,7 +212,6 @@ def _no_section(dotted: str, task: str, algorithm: str) -> str:
 
 
 def _preset_sections(task: str, algorithm: str, preset: str) -> dict[str, dict[str, object]]:
-    """Return the settings, by section, that a preset and the task change."""
     asked, known = ALGORITHMS[algorithm].task_settings, task_class(task).Settings.model_fields
     sections: dict[str, dict[str, object]] = {"task": {name: asked[name] for name in asked if name in known}}
     sections |= {name: {} for name in (algorithm, "network", "prior", "evaluation")}

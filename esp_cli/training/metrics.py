@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from esp_cli.files.failures import attempting
+from esp_cli.files.formatting import attempting
 from esp_cli.files.opening import open_own, open_regular, require_held
 from esp_cli.files.writing import MAX_LINE_BYTES, TAIL_BYTES, replacing, write_all
 from esp_cli.training.trackers import Guarded
@@ -99,10 +99,7 @@ def read_last_row(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def truncate_metrics(path: str | os.PathLike[str], last_step: int) -> None:
-    """Rewrite a metrics file, or make it, without a torn last line and without the rows past the step of a checkpoint.
-
-    What remains is kept byte for byte.
-    """
+    """Rewrite a metrics file, or make it, without a torn last line and the rows past the step of a checkpoint."""
     path = Path(path)
     with attempting("write", path, MetricsError):
         os.close(open_own(path, os.O_WRONLY))
@@ -217,7 +214,6 @@ def _number(name: str, value: Any) -> float | int | None:
 
 
 def _rows(path: Path) -> Iterator[tuple[bytes, dict[str, Any]]]:
-    """Yield each row with the line that it stands on, without its break."""
     if not path.is_file():
         raise MetricsError(f"{path} does not exist or is not a regular file; check the path")
     with attempting("read", path, MetricsError), open_regular(path) as file:

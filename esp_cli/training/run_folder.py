@@ -28,7 +28,7 @@ from typing import Any
 from torch import Tensor
 
 from esp_cli.files.documents import DocumentFormat
-from esp_cli.files.failures import attempting
+from esp_cli.files.formatting import attempting
 from esp_cli.files.opening import holding, open_own, require_held
 from esp_cli.files.writing import TEMPORARY_PREFIX, remove_file, sync_file
 from esp_cli.training.checkpoint import (
@@ -85,13 +85,7 @@ class RunFolder:
     def create(
         cls, path: str | os.PathLike[str], config: dict[str, Any], initial: Mapping[str, Tensor] | None = None
     ) -> RunFolder:
-        """Make a run folder; its configuration is written last, so that a folder with one is complete.
-
-        Args:
-            path: a folder that is missing, empty, or left half-made by a killed process.
-            config: the resolved configuration as JSON has it.
-            initial: weights of the policy that the run starts from.
-        """
+        """Make a run folder; its configuration is written last, so that a folder with one is complete."""
         path = Path(path)
         with attempting("make the run folder", path, RunFolderError):
             if path.exists() and not path.is_dir():
@@ -114,7 +108,6 @@ class RunFolder:
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> RunFolder:
-        """Open an existing run folder."""
         path = Path(path)
         if (path / CONFIG).is_file():
             return cls(path, *read_run_config(path / CONFIG))
@@ -138,11 +131,9 @@ class RunFolder:
             yield
 
     def checkpoint_path(self, step: int, final: bool = False) -> Path:
-        """Return the file of the checkpoint at a step (env steps per seed)."""
         return self.path / CHECKPOINTS / f"step-{step:012d}{'-final' if final else ''}.safetensors"
 
     def checkpoints(self) -> list[Path]:
-        """Return the checkpoint files, oldest first."""
         return checkpoints_in(self.path)
 
     def write_checkpoint(
@@ -167,10 +158,7 @@ class RunFolder:
         self._remove([*past, *regular[:-KEPT_CHECKPOINTS], *finals[:-1]])
 
     def write_policy(self, tensors: Mapping[str, Tensor], meta: Mapping[str, Any]) -> None:
-        """Write the trained policy as a file of its own that needs no run folder; training is done with that.
-
-        Checkpoints before the final one go: with a replay they are large, and nothing goes on from them any more.
-        """
+        """Write the trained policy as a file of its own that needs no run folder; training is done with that."""
         write_policy(self.policy_path, tensors, meta)
         self._remove_superseded()
 
@@ -218,13 +206,11 @@ class RunFolder:
             )
 
     def _remove_superseded(self) -> None:
-        """Remove the checkpoints before the final one, if there is a final one."""
         files = self.checkpoints()
         if any(map(_is_final, files)):
             self._remove(file for file in files if not _is_final(file))
 
     def _remove(self, checkpoints: Iterable[Path]) -> None:
-        """Remove checkpoints, but none of another run; a damaged one does not say of which it is."""
         for file in checkpoints:
             own = True
             with contextlib.suppress(CheckpointError):
@@ -262,7 +248,6 @@ def _refuse_taken(path: Path) -> None:
 
 
 def _is_leftover(entry: Path) -> bool:
-    """Return whether `RunFolder.create`, killed before its end, may have left this."""
     if entry.name == CHECKPOINTS:
         return entry.is_dir() and not any(entry.iterdir())
     if entry.name == METRICS:

@@ -19,8 +19,7 @@ from esp_cli.files.writing import replace_file
 from esp_envs.errors import UserError
 from esp_envs.installed import install
 
-Row = Mapping[str, Any]
-"""Metrics by name: a number, None, or a list with one of them per seed."""
+Row = Mapping[str, Any]  # metrics by name: a number, None, or a list with one of them per seed
 
 
 @dataclass(frozen=True)
@@ -42,12 +41,10 @@ class TensorBoard:
         self._board(None)
 
     def write(self, step: int, values: Row) -> None:
-        """Add a scalar per metric and seed."""
         for name, seed, value in scalars(values, self._run.seeds):
             self._board(seed).add_scalar(name, value, step)
 
     def close(self) -> None:
-        """Close the event files."""
         for board in self._boards.values():
             board.close()
 
@@ -64,10 +61,7 @@ class TensorBoard:
 
 
 class WeightsAndBiases:
-    """Weights & Biases in `wandb/`: offline, unless the environment variable WANDB_MODE says otherwise.
-
-    `wandb sync RUN/wandb/offline-run-*` uploads it. A resumed run goes on under the same id.
-    """
+    """Weights & Biases in `wandb/`: offline, unless the environment variable WANDB_MODE says otherwise."""
 
     def __init__(self, run: TrackedRun) -> None:
         import wandb  # noqa: PLC0415 - only where it is asked for
@@ -99,11 +93,9 @@ class WeightsAndBiases:
         self._run.define_metric("*", step_metric="step")
 
     def write(self, step: int, values: Row) -> None:
-        """Log the means under their names, and each seed's number under seed-k/NAME."""
         self._run.log({"step": step, **named(values, self._seeds)})
 
     def close(self) -> None:
-        """Finish the run."""
         try:
             self._run.finish()
         finally:
@@ -115,10 +107,7 @@ class WeightsAndBiases:
 
 
 class MlFlow:
-    """MLflow in `mlruns/`, a file store, unless MLFLOW_TRACKING_URI says otherwise; one run of the experiment "esp".
-
-    `mlflow ui --backend-store-uri RUN/mlruns` shows it.
-    """
+    """MLflow in `mlruns/`, a file store, unless MLFLOW_TRACKING_URI says otherwise; one run of the experiment "esp"."""
 
     def __init__(self, run: TrackedRun) -> None:
         # read when mlflow is imported or a store is opened; what the user has set stays
@@ -148,14 +137,12 @@ class MlFlow:
         self._client.update_run(self._run_id, status="RUNNING")
 
     def write(self, step: int, values: Row) -> None:
-        """Log the means under their names, and each seed's number under seed-k/NAME."""
         now_ms = int(time.time() * 1000)
         metrics = [self._metric(name, value, now_ms, step) for name, value in named(values, self._seeds).items()]
         for first in range(0, len(metrics), 1000):
             self._client.log_batch(self._run_id, metrics=metrics[first : first + 1000])
 
     def close(self) -> None:
-        """Mark the run as ended."""
         self._client.set_terminated(self._run_id)
 
 
@@ -182,7 +169,6 @@ class Guarded:
             self._attempt("write", lambda: tracker.write(step, values))
 
     def close(self) -> None:
-        """Close the tracker, unless it has failed before."""
         if (tracker := self._tracker) is not None:
             self._attempt("close", tracker.close)
 

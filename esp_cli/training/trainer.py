@@ -16,13 +16,19 @@ from pydantic import BaseModel, Field, ValidationError
 from torch import Tensor
 
 from esp_cli.algorithms.normalisation import with_variances
-from esp_cli.training.build import build_environment, build_learner, first_look
+from esp_cli.training.build import (
+    PolicyController,
+    build_environment,
+    build_learner,
+    first_look,
+    generators,
+    play,
+    stream_seeds,
+)
 from esp_cli.training.checkpoint import describe_policy, read_initial, same
 from esp_cli.training.config import RunConfig
 from esp_cli.training.metrics import MetricsWriter, column, read_metrics, truncate_metrics
-from esp_cli.training.play import PolicyController, play
 from esp_cli.training.run_folder import RunFolder
-from esp_cli.training.streams import generators, stream_seeds
 from esp_cli.training.trackers import TrackedRun, open_trackers, require
 from esp_envs.errors import UserError
 
@@ -71,14 +77,7 @@ Listener = Callable[[Progress], bool | None]
 
 
 class Trainer:
-    """One run: S seeds of one configuration.
-
-    Args:
-        config: what to train.
-        folder: where results go; held by the caller's lock. A checkpoint found there is continued.
-        track: names of trackers that get the metrics too.
-        check: take a short look at a task that is not built in before the first step, and note what it found.
-    """
+    """One run: S seeds of one configuration, in a folder that the caller locked; a checkpoint there is continued."""
 
     def __init__(self, config: RunConfig, folder: RunFolder, track: Sequence[str] = (), check: bool = True) -> None:
         self.config, self.folder, self.track = config, folder, tuple(track)
@@ -94,17 +93,14 @@ class Trainer:
 
     @property
     def step(self) -> int:
-        """Environment steps per seed so far."""
         return self.iteration * self.learner.steps_per_iteration
 
     @property
     def total_iterations(self) -> int:
-        """Iterations of the whole run, the last one rounded up."""
         return -(-self.config.steps // self.learner.steps_per_iteration)
 
     @property
     def is_complete(self) -> bool:
-        """Whether nothing is left to do."""
         return self.iteration >= self.total_iterations
 
     @property
@@ -118,11 +114,7 @@ class Trainer:
         return {mode: column(rows, f"eval/return_{mode}")[1][-1] for mode in ("greedy", "stochastic")}
 
     def run(self, listener: Listener) -> bool:
-        """Train to the end or until the listener asks to stop; return whether the run is complete.
-
-        Raises:
-            UserError: every seed stopped on a number that is not finite.
-        """
+        """Train to the end or until the listener asks to stop; return whether the run is complete."""
         self._refuse_if_all_stopped()
         started, due = time.monotonic() - self.elapsed_s, time.monotonic() + CHECKPOINT_SECONDS
         tracked = TrackedRun(self.folder.path, self.config.seeds, self.folder.config, self.step)
@@ -155,7 +147,6 @@ class Trainer:
             )
 
     def _iterate(self) -> dict[str, Any]:
-        """Collect, learn, freeze broken seeds, evaluate where it is time; return the metrics."""
         begun = time.monotonic()
         before = self.step // self.config.evaluation.every_steps
         progress = self.iteration / self.total_iterations
@@ -205,13 +196,11 @@ class Trainer:
         return [tensor.clone() for tensor in self.learner.seed_tensors()]
 
     def _record(self, writer: MetricsWriter, row: dict[str, Any], listener: Listener) -> bool:
-        """Write a metrics row, without the numbers of stopped seeds, and tell the listener."""
         values, notes = writer.write(self.step, row, self.stopped_seeds), tuple(self.notes)
         self.notes.clear()
         return listener(Progress(self.step, self.config.steps, values, notes)) is not False
 
     def _checkpoint(self) -> float:
-        """Write a checkpoint; return how many seconds that took."""
         begun = time.monotonic()
         meta = {
             "iteration": self.iteration,
@@ -223,7 +212,6 @@ class Trainer:
         return time.monotonic() - begun
 
     def _restore(self, check: bool) -> None:
-        """Continue from the newest good checkpoint; without one, start from the beginning."""
         found = self.folder.latest_checkpoint(self.notes.append)
         if found is not None:
             self._load(found[0])
@@ -239,7 +227,6 @@ class Trainer:
         truncate_metrics(self.folder.metrics_path, self.step if found else -1)
 
     def _stand(self, meta: Mapping[str, Any]) -> None:
-        """Go to where the description of a checkpoint says that the run stands."""
         try:
             stands = Standing.model_validate(meta)
         except ValidationError:
@@ -255,7 +242,6 @@ class Trainer:
             )
 
     def _load(self, tensors: dict[str, Tensor]) -> None:
-        """Load the state of the learner; refuse a checkpoint whose names, shapes or types are not the learner's."""
         before, tensors = self.learner.state_dict(), with_variances(tensors)
         self.learner.load_state_dict(tensors)
         now, needed = self.learner.state_dict(), self.learner.state_dict(complete=True)

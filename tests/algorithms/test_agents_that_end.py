@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from esp_cli.algorithms.losses import explained_variance, gae, normalise_per_seed, td_targets
+from esp_cli.algorithms.objectives import explained_variance, gae, normalise_per_seed, td_targets
 from esp_cli.checking import check_symmetry
 from esp_cli.prior import mean_per_seed
 from esp_cli.symmetry import transform_set

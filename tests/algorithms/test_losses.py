@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from esp_cli.algorithms.losses import explained_variance, gae, normalise_per_seed, td_targets
+from esp_cli.algorithms.objectives import explained_variance, gae, normalise_per_seed, td_targets
 from esp_cli.prior import mean_per_seed
 
 

@@ -5,7 +5,7 @@ import torch
 
 from esp_cli.algorithms.replay import EpisodeBatch, EpisodeCollector, EpisodeReplay
 from esp_cli.symmetry import transform_set
-from esp_cli.training.streams import generators
+from esp_cli.training.build import generators
 from esp_envs.base import Step
 from esp_envs.registry import make
 from tests.algorithms.off_policy import learner, numbered_batch, turn

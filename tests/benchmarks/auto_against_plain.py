@@ -25,9 +25,8 @@ import torch
 
 from esp_cli.checking.measured import prepared
 from esp_cli.policies.statistics import difference
-from esp_cli.training.build import build_environment, build_learner
+from esp_cli.training.build import PolicyController, build_environment, build_learner, play
 from esp_cli.training.config import resolve_config
-from esp_cli.training.play import PolicyController, play
 from esp_envs.mpe.task import FORCE
 from esp_envs.registry import register
 from esp_envs.settings import TaskSettings

@@ -29,9 +29,8 @@ from rich.console import Console
 from rich.table import Table
 from scipy.stats import ttest_ind
 
-from esp_cli.training.build import build_environment, build_learner
+from esp_cli.training.build import PolicyController, build_environment, build_learner, play
 from esp_cli.training.config import resolve_config
-from esp_cli.training.play import PolicyController, play
 
 ALGORITHMS = ("mappo", "maddpg", "qmix")
 TASKS: dict[str, dict[str, object]] = {

@@ -13,7 +13,7 @@ from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.symmetry import FiniteGroup, parse_elements
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
-from esp_envs.conformance.subject import MakeWorlds
+from esp_envs.promises import MakeWorlds
 from esp_envs.registry import make
 
 

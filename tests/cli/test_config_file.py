@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from esp_cli.training.config import RunConfig
-from esp_cli.training.config_file import parse_config
 from esp_cli.training.run_folder import RunFolder
+from esp_cli.training.settings import parse_config
 from tests.cli.running import printed, refused, stored_config, written
 
 

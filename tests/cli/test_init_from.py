@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from esp_cli.training.checkpoint import load_checkpoint
-from esp_cli.training.config_file import parse_config, read_config_file
 from esp_cli.training.run_folder import RunFolder
+from esp_cli.training.settings import parse_config, read_config_file
 from esp_envs.mpe.frozen_prey import POLICY_FORMAT
 from tests.cli.running import STEPS, TINY_OPTIONS, esp, printed, refused, stored_config, train_tiny, written
 

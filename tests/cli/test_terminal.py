@@ -22,8 +22,7 @@ from rich.table import Table
 from typer.testing import CliRunner
 
 from esp_cli import console
-from esp_cli.algorithms.presets import PRESETS
-from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.algorithms.presets import ALGORITHMS, PRESETS
 from esp_cli.app import app, build_command
 from esp_cli.commands import COMMANDS
 from esp_cli.commands import help as known

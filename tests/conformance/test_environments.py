@@ -16,7 +16,7 @@ from torch import Tensor
 
 from esp_envs import Environment, Items, Layout, make, task_class, task_names
 from esp_envs.conformance import PROMISES, NotAsked, Subject, check
-from esp_envs.conformance.subject import nearly, same_step
+from esp_envs.promises import nearly, same_step
 
 SETTINGS: dict[str, list[dict[str, object]]] = {
     "navigation": [

@@ -16,9 +16,7 @@ from esp_cli.drawing.films import write_gif, write_mp4
 from esp_cli.drawing.recording import HOLD_SECONDS, framed, record
 from esp_cli.networks.policy import StochasticPolicy
 from esp_cli.policies.loading import TrainedPolicy
-from esp_cli.training.build import build_environment
-from esp_cli.training.play import PolicyController
-from esp_cli.training.streams import generators
+from esp_cli.training.build import PolicyController, build_environment, generators
 from esp_envs import Body, Scene
 from esp_envs.base import Environment
 from esp_envs.compass import Compass

@@ -9,7 +9,7 @@ from operator import methodcaller
 import pytest
 import torch
 
-from esp_cli.training.play import ScriptedController, play
+from esp_cli.training.build import ScriptedController, play
 from esp_envs import make
 from esp_envs.mpe import covering, many
 

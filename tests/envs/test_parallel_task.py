@@ -16,7 +16,7 @@ from esp_cli.training.config import resolve_config
 from esp_envs import Continuous, Environment, Field, Kind, generators_for, layout, make, register
 from esp_envs.adapters.pettingzoo import ParallelSettings, ParallelTask
 from esp_envs.conformance import Subject, check
-from esp_envs.conformance.subject import same_step
+from esp_envs.promises import same_step
 from esp_envs.registry import TASKS
 from esp_envs.spec import Discrete
 from tests.own_tasks import lines_of, page_files, save_page_files

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from esp_envs import Environment, make
-from esp_envs.wildlife.wildlife import MOVES
+from esp_envs.wildlife import MOVES
 from tests.envs import wildlife_rules
 from tests.envs.playing import episode_return
 

@@ -8,12 +8,11 @@ from types import SimpleNamespace
 
 import torch
 
-from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.policies.loading import TrainedPolicy
-from esp_cli.training.build import build_environment
+from esp_cli.training.build import build_environment, generators
 from esp_cli.training.checkpoint import describe_policy, save_checkpoint
 from esp_cli.training.config import resolve_config
-from esp_cli.training.streams import generators
 from esp_envs.mpe.frozen_prey import POLICY_FORMAT
 
 KINDS = {

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from esp_cli.export import c_file, check, epuck
+from esp_cli.export.esp_epuck import PATIENCE_S, Pilot
 from esp_cli.export.export import export
-from esp_cli.export.runtime.esp_epuck import PATIENCE_S, Pilot
 from esp_envs.epuck.robot import Arena
 from tests.export.policies import drawn_policy, imported
 

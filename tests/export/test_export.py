@@ -16,8 +16,8 @@ from esp_cli.export import c_file, check, onnx_file
 from esp_cli.export.c_file import cost
 from esp_cli.export.check import compare, take_sample
 from esp_cli.export.export import FORMATS, export
+from esp_cli.export.numpy_policy import NumpyPolicy
 from esp_cli.export.program import program_of
-from esp_cli.export.runtime.numpy_policy import NumpyPolicy
 from esp_cli.files.opening import FolderLostError, taking_turns
 from esp_cli.files.writing import replace_file
 from esp_envs.errors import UserError

@@ -17,9 +17,9 @@ from esp_cli.export import c_file, onnx_file
 from esp_cli.export.c_file import c_runner, c_source
 from esp_cli.export.check import compare, take_sample
 from esp_cli.export.export import export
+from esp_cli.export.numpy_policy import NumpyPolicy
 from esp_cli.export.onnx_file import onnx_model, onnx_runner
 from esp_cli.export.program import program_of
-from esp_cli.export.runtime.numpy_policy import NumpyPolicy
 from esp_cli.export.torch_file import TorchProgram
 from esp_envs import register
 from esp_envs.registry import TASKS

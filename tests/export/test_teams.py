@@ -14,9 +14,9 @@ from esp_cli.export import c_file, check
 from esp_cli.export.c_file import c_runner, c_source
 from esp_cli.export.export import export
 from esp_cli.export.layers import activation, affine, aggregate, convolution, cut, global_max_pool
+from esp_cli.export.numpy_policy import NumpyPolicy
 from esp_cli.export.onnx_file import onnx_runner
 from esp_cli.export.program import Program, program_of
-from esp_cli.export.runtime.numpy_policy import NumpyPolicy
 from esp_cli.export.torch_file import TorchProgram, torch_archive, torch_runner
 from esp_cli.policies.loaded import LoadedPolicy
 from tests.export.policies import drawn_policy

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from esp_cli import load_policy
-from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.networks.build import NETWORKS
 from esp_cli.training.metrics import column, read_metrics
 from tests.cli.running import esp, refused

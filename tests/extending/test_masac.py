@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from esp_cli import load_policy
-from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.training.metrics import column, read_metrics
 from esp_envs.fields import Field, Kind, layout
 from esp_envs.spec import Continuous

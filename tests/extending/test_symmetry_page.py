@@ -17,7 +17,7 @@ from torch import Tensor
 
 from esp_cli import Symmetry, Transitions
 from esp_cli.networks.constrained import EquivariantConfig
-from esp_cli.networks.io_spec import IoSpec
+from esp_cli.networks.contract import IoSpec
 from esp_cli.prior import PriorConfig, SeedBatch, SymmetryPrior
 from esp_cli.symmetry import (
     Element,

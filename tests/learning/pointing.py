@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from esp_cli.training.play import Controller, play
-from esp_cli.training.streams import stream_seeds
+from esp_cli.training.build import Controller, play, stream_seeds
 from esp_envs.base import Environment, Observation, Step, generator_states, generators_for, restore_generators
 from esp_envs.scene import Scene
 from esp_envs.settings import TaskSettings

@@ -6,11 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.networks.plain import MlpConfig
 from esp_cli.prior import PriorConfig
-from esp_cli.training.play import PolicyController
-from esp_cli.training.streams import generators, stream_seeds
+from esp_cli.training.build import PolicyController, generators, stream_seeds
 from tests.learning.pointing import SEEDS, AlwaysRight, Pointing, score
 
 ROUNDS = 40

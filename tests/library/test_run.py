@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from esp_cli import Progress, Run, load_policy, train
-from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.run import begin
 from esp_cli.training.config import resolve_config
 from esp_cli.training.metrics import Metrics, column, read_metrics

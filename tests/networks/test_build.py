@@ -13,9 +13,9 @@ from esp_cli.networks.build import NETWORKS, build_network, perceptron
 from esp_cli.networks.contract import Memoryless, NetworkConfig
 from esp_cli.networks.layers import SeedLinear
 from esp_cli.networks.policy import StochasticPolicy
+from esp_cli.training.build import generators
 from esp_cli.training.config import resolve_config
-from esp_cli.training.config_file import parse_config
-from esp_cli.training.streams import generators
+from esp_cli.training.settings import parse_config
 from esp_envs.registry import make
 
 

@@ -8,12 +8,12 @@ from torch import Tensor, nn
 
 from esp_cli.networks.build import NETWORKS, NetworkConfig, build_network
 from esp_cli.networks.constrained import ConstrainedLinear
-from esp_cli.networks.io_spec import IoSpec
+from esp_cli.networks.contract import IoSpec
 from esp_cli.networks.layers import SeedMLP, orthogonal
 from esp_cli.networks.message_passing import MessagePassing, PictureEncoder, distinct
 from esp_cli.networks.symmetrised import Symmetrised
 from esp_cli.symmetry import PlaneElement, cyclic, dihedral, network_equivariance_error, parse_group, transform_set
-from esp_cli.symmetry.intertwiners import Block, layout_blocks, regular, trivial
+from esp_cli.symmetry.maps import Block, layout_blocks, regular, trivial
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
 from esp_envs import make

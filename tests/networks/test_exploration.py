@@ -7,7 +7,7 @@ from esp_cli.networks.build import NETWORKS
 from esp_cli.networks.exploration import BoundedPoint, EpsilonGreedy, ExploringCategorical
 from esp_cli.networks.policy import HistoryPolicy
 from esp_cli.symmetry import transform_set
-from esp_cli.training.streams import generators
+from esp_cli.training.build import generators
 from esp_envs.registry import make
 from esp_envs.spec import Continuous, Field, Kind, layout
 

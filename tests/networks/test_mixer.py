@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch.nn.functional import elu
 
-from esp_cli.networks import mixer as mixing
-from esp_cli.networks.mixer import MonotonicMixer
-from esp_cli.training.streams import generators
+from esp_cli.networks import joint_q as mixing
+from esp_cli.networks.joint_q import MonotonicMixer
+from esp_cli.training.build import generators
 from tests.networks.gradients import assert_same_gradients
 
 SEEDS, AGENTS, STATE, WIDTH = (0, 1), 3, 5, 8

@@ -6,7 +6,7 @@ import torch
 from esp_cli.networks.exploration import EpsilonGreedy
 from esp_cli.networks.plain import MlpConfig
 from esp_cli.networks.policy import HistoryPolicy
-from esp_cli.networks.separate import action_parts
+from esp_cli.networks.symmetrised import action_parts
 from esp_cli.symmetry import mirror
 from esp_cli.symmetry.transforms import build_transform
 from esp_envs.registry import make

@@ -6,15 +6,14 @@ import pytest
 import torch
 
 from esp_cli.networks.build import build_network
-from esp_cli.networks.io_spec import IoSpec
+from esp_cli.networks.contract import IoSpec
 from esp_cli.networks.kernels.sets import compiled_distances, compiled_pool
 from esp_cli.networks.plain import MlpConfig
 from esp_cli.networks.set_equivariant import SetEquivariantConfig
 from esp_cli.networks.set_features import Rows, distances_among
 from esp_cli.networks.sets import SetConfig
-from esp_cli.training.build import build_learner
+from esp_cli.training.build import build_learner, generators
 from esp_cli.training.config import resolve_config
-from esp_cli.training.streams import generators
 from esp_envs import Discrete, Field, Items, Kind, Spaces, UserError, layout, make
 from tests.networks.gradients import assert_same_gradients
 from tests.networks.kernels.compiler import assert_same_bits_alone_and_for_any_threads, needs_compiler

@@ -21,8 +21,8 @@ from esp_cli.policies.bundled import MANIFEST, Entry, bundled_folder, find, read
 from esp_cli.policies.bundling import best_seed, bundle, play_greedily, score_of
 from esp_cli.policies.evaluation import evaluate
 from esp_cli.policies.loading import TrainedPolicy, load_entry, open_policy
+from esp_cli.training.build import Episodes
 from esp_cli.training.config import RunConfig, resolve_config, resolve_task_settings
-from esp_cli.training.play import Episodes
 from tests.export.policies import drawn_policy
 
 ENTRIES = read_bundled()

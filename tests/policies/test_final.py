@@ -15,9 +15,7 @@ from esp_cli.policies import evaluation as final
 from esp_cli.policies.evaluation import FinalEvaluation, evaluate, play_batches, summarise_returns
 from esp_cli.policies.loading import TrainedPolicy, _stopped
 from esp_cli.policies.statistics import SeedSummary
-from esp_cli.training.build import build_environment
-from esp_cli.training.play import PolicyController, ScriptedController, play
-from esp_cli.training.streams import generators
+from esp_cli.training.build import PolicyController, ScriptedController, build_environment, generators, play
 from tests.training.runs import tiny_config
 
 

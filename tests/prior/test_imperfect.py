@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.checking.measured import prepared
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.prior import PriorConfig, SymmetryPrior

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from esp_cli.reporting.answer import answer
 from esp_cli.reporting.collect import collect_study
+from esp_cli.reporting.page import answer
 from esp_cli.studies.study import StudyFolder
 from tests.studies.small_studies import small_study, write_run
 

@@ -22,7 +22,7 @@ from esp_cli.studies.search import Search
 from esp_cli.studies.tuning import Point, Tuning
 from esp_cli.studies.tuning_space import Dimension
 from esp_cli.training.config import resolve_config
-from esp_cli.training.config_file import read_config_file
+from esp_cli.training.settings import read_config_file
 from tests.studies.test_tuning import SPACE, tuning
 
 

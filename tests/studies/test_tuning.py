@@ -8,7 +8,7 @@ import re
 
 import pytest
 
-from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.studies.tuning import Point, Tuning, curve_of, fresh_study, score
 from esp_cli.studies.tuning_space import Dimension, default_space, read_space, space_of
 from esp_cli.training.metrics import MetricsError

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from esp_cli.symmetry import PlaneElement, cyclic, dihedral
-from esp_cli.symmetry.intertwiners import (
+from esp_cli.symmetry.maps import (
     Block,
     action_blocks,
     intertwiners,

@@ -35,9 +35,9 @@ from esp_cli.studies.tuning_space import read_space
 from esp_cli.symmetry.admission import admitted_elements
 from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
 from esp_cli.training.config import resolve_config
-from esp_cli.training.config_file import parse_config, read_config_file
 from esp_cli.training.metrics import MetricsError, column, read_last_row, read_metrics
 from esp_cli.training.run_folder import RUN_FORMAT, RunFolder
+from esp_cli.training.settings import parse_config, read_config_file
 from esp_cli.training.trainer import Trainer
 from esp_envs.registry import make
 from esp_envs.spec import TaskSpec

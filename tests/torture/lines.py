@@ -16,7 +16,7 @@ from typing import Any, Literal
 from pydantic import BaseModel
 from typer.testing import CliRunner
 
-from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.app import app, build_command
 from esp_cli.commands import COMMANDS, train
 from esp_cli.networks.build import NETWORKS

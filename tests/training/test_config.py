@@ -15,7 +15,7 @@ from esp_cli.networks.plain import GruConfig, MlpConfig
 from esp_cli.prior import PriorConfig
 from esp_cli.training import config as config_module
 from esp_cli.training.config import EvaluationConfig, RunConfig, completed, resolve_config
-from esp_cli.training.config_file import parse_config
+from esp_cli.training.settings import parse_config
 from esp_envs.registry import task_class
 
 

@@ -10,8 +10,8 @@ import torch
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
 from esp_cli.training.config import RunConfig
-from esp_cli.training.config_file import parse_config
 from esp_cli.training.run_folder import RunFolder
+from esp_cli.training.settings import parse_config
 from esp_cli.training.trainer import Trainer
 from esp_envs.mpe.frozen_prey import POLICY_FORMAT
 from tests.training.runs import tiny_config, tiny_folder

@@ -14,8 +14,8 @@ from esp_cli.files.opening import FolderLostError, HeldFolder, holding
 from esp_cli.files.writing import remove_file, replace_file
 from esp_cli.training import trainer
 from esp_cli.training.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
-from esp_cli.training.config_file import parse_config
 from esp_cli.training.run_folder import RunFolder
+from esp_cli.training.settings import parse_config
 from tests.forks import fork, said, wait
 from tests.training.runs import tiny_folder
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from esp_cli.algorithms.registry import ALGORITHMS
+from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.training import build
 from esp_cli.training.build import build_learner, spec_of
 from esp_cli.training.config import resolve_config

@@ -7,8 +7,7 @@ import torch
 
 from esp_cli.networks.build import NETWORKS
 from esp_cli.networks.policy import StochasticPolicy
-from esp_cli.training.play import PolicyController, ScriptedController, play
-from esp_cli.training.streams import generators
+from esp_cli.training.build import PolicyController, ScriptedController, generators, play
 from esp_envs.base import Environment, Observation, Step, generators_for
 from esp_envs.scene import Scene
 from esp_envs.settings import TaskSettings

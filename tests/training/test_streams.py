@@ -4,7 +4,7 @@ import itertools
 
 import torch
 
-from esp_cli.training.streams import generators, stream_seed, stream_seeds
+from esp_cli.training.build import generators, stream_seed, stream_seeds
 
 
 def test_a_streams_number_never_changes():

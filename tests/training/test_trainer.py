@@ -11,11 +11,11 @@ import torch
 
 from esp_cli import app
 from esp_cli.training import trainer as training
+from esp_cli.training.build import play
 from esp_cli.training.config import resolve_config
-from esp_cli.training.config_file import parse_config
 from esp_cli.training.metrics import read_metrics
-from esp_cli.training.play import play
 from esp_cli.training.run_folder import RunFolder
+from esp_cli.training.settings import parse_config
 from esp_cli.training.trainer import Trainer, checkpoint_seconds
 from tests.forks import fork, said, wait
 from tests.training.runs import tiny_config, tiny_folder

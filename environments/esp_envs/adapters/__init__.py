@@ -17,11 +17,7 @@ def seed_of(base: int, *which: int) -> int:
 
 
 def require_attributes(task: object, *names: str) -> None:
-    """Refuse a task whose class leaves out what its base class asks for, or whose metrics are one text.
-
-    Raises:
-        UserError: names what is wrong.
-    """
+    """Refuse a task whose class leaves out what its base class asks for, or whose metrics are one text."""
     if isinstance(metrics := getattr(task, "metrics", ()), str):
         raise UserError(f"the metrics of {type(task).__name__} are a text; give a tuple: ('{metrics}',)")
     missing = [name for name in names if getattr(task, name, None) is None]

@@ -27,10 +27,8 @@ from esp_envs.errors import UserError
 from esp_envs.installed import last_line
 
 _RESET, _STEP, _PLACE, _LEAVE = b"reset", b"step", b"place", b"leave"
-TERMINATED, TRUNCATED = 1, 2
-"""What `Board.ended` says of a copy whose episode ended in this step."""
-NOW, FINAL = 0, 1
-"""Where a board holds what is seen now, and what was seen before an automatic reset."""
+TERMINATED, TRUNCATED = 1, 2  # what `Board.ended` says of a copy whose episode ended in this step
+NOW, FINAL = 0, 1  # where a board holds what is seen now, and what was seen before an automatic reset
 
 
 @dataclass(frozen=True)
@@ -120,11 +118,6 @@ class WorkerCopies:
 
     A command is one byte in a pipe; its answer is empty, or the sentence of what went wrong. A worker leaves when its
     pipe closes, so none outlives this process.
-
-    Args:
-        sizes: of the board.
-        make_stepper: called in each worker with the board and its share of the copies.
-        count: of the workers.
     """
 
     def __init__(self, sizes: Sizes, make_stepper: Callable[[Board, range], Stepper], count: int) -> None:
@@ -145,11 +138,9 @@ class WorkerCopies:
         self._wait()
 
     def reset(self) -> None:
-        """Start an episode in every copy."""
         self._command(_RESET)
 
     def step(self) -> None:
-        """Advance every copy by one step."""
         self._command(_STEP)
 
     def place(self) -> None:
@@ -163,11 +154,7 @@ class WorkerCopies:
         self._wait()
 
     def _wait(self) -> None:
-        """Read one answer of every worker.
-
-        Raises:
-            UserError: an environment raised, or a worker died.
-        """
+        """Read one answer of every worker."""
         failures = [failure for pipe, worker in self._workers if (failure := _answer(pipe, worker))]
         if failures:
             raise UserError(failures[0])
@@ -196,7 +183,6 @@ def _work(
     board: Board,
     share: range,
 ) -> None:
-    """Obey commands until the pipe closes."""
     for stop in (signal.SIGINT, signal.SIGTERM):  # the parent stops in its own time, and then closes the pipe
         signal.signal(stop, signal.SIG_IGN)
     for end in ends_of_the_parent:
@@ -228,7 +214,6 @@ def _failure_of(command: Callable[[], None]) -> bytes:
 
 
 def _stop(workers: Sequence[tuple[Connection, ForkProcess]]) -> None:
-    """Let the workers leave; end those that do not."""
     for pipe, _ in workers:
         with contextlib.suppress(OSError):
             pipe.send_bytes(_LEAVE)

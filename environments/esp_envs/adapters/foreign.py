@@ -25,8 +25,7 @@ _PARTS = {
     "reset": ("observations", "infos"),
     "step": ("observations", "rewards", "terminated", "truncated", "infos"),
 }
-EVERYONE = "__all__"
-"""The entry of a mapping of flags that speaks of all agents."""
+EVERYONE = "__all__"  # the entry of a mapping of flags that speaks of all agents
 
 
 def require_kind(env: Any, wanted: str, maker: str) -> None:
@@ -95,11 +94,7 @@ def space_of(env: Any, agent: Any) -> Any:
 
 
 def reset(env: Any, seed: int) -> Any:
-    """Reset a copy by its seed.
-
-    Raises:
-        UserError: `reset` takes no seed.
-    """
+    """Reset a copy by its seed; refuse one whose `reset` takes none."""
     try:
         return env.reset(seed=seed)
     except TypeError as error:
@@ -109,11 +104,7 @@ def reset(env: Any, seed: int) -> Any:
 
 
 def parts(given: Any, method: str) -> tuple[Mapping[Any, Any], ...]:
-    """Return the mappings by agent that `reset` or `step` has returned.
-
-    Raises:
-        UserError: it returned something else.
-    """
+    """Return the mappings by agent that `reset` or `step` has returned."""
     names = _PARTS[method]
     if isinstance(given, tuple) and len(given) == len(names) and all(map(_is_mapping, given)):
         return given
@@ -128,16 +119,7 @@ def _is_mapping(part: Any) -> bool:
 
 
 def numbers(given: Any, what: str, width: int | None = None) -> NDArray[np.float32]:
-    """Return what an environment or a hook gives as a row of numbers.
-
-    Args:
-        given: an array, a tensor, a number, or a list of numbers.
-        what: how the sentence of an error begins.
-        width: how many numbers there have to be.
-
-    Raises:
-        UserError: it holds something else, or another number of them.
-    """
+    """Return what an environment or a hook gives as a row of `width` numbers; `what` begins an error's sentence."""
     if isinstance(given, torch.Tensor):
         given = given.detach().cpu()
         given = given.float() if given.dtype == torch.bfloat16 else given  # which numpy does not have

@@ -26,13 +26,11 @@ class SingleAgentTask(ParallelTask):
         """Return one new copy, a `gymnasium.Env`."""
 
     def make_one(self) -> Any:
-        """Return one new copy as an environment of one agent."""
         single = self.make_single()
         foreign.require_kind(single, foreign.SINGLE, "make_single")
         return _OneAgent(single)
 
     def own_of(self, env: Any) -> Any:
-        """Return the environment that `make_single` made."""
         return env.own
 
 

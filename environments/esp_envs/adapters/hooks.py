@@ -95,11 +95,7 @@ class CopyHooks(ABC):
         return action
 
     def allowed(self, agent: str, observation: Any, info: Mapping[str, Any]) -> Array:
-        """Return the mask of an agent's actions: the entry "action_mask" of its observation, or else of its info.
-
-        Raises:
-            UserError: neither has one.
-        """
+        """Return the mask of an agent's actions: the entry "action_mask" of its observation, or else of its info."""
         for place in (observation, info):
             if _has(place, "action_mask"):
                 return np.asarray(place["action_mask"])
@@ -149,11 +145,7 @@ class Copy:
         return foreign.naming(f"copy {k} of {type(self._task).__name__}", what)
 
     def start(self, seed: int) -> tuple[Mapping[Any, Any], ...]:
-        """Reset the copy; return what its agents see, and their infos.
-
-        Raises:
-            UserError: it returns something else, or a learning agent sees nothing.
-        """
+        """Reset the copy; return what its agents see, and their infos."""
         seen, infos = foreign.parts(foreign.reset(self.env, seed), "reset")
         for name in self.learners:
             if name not in seen:
@@ -173,11 +165,7 @@ class Copy:
         return np.array([rows.get(name, np.zeros(self._task.observation.width)) for name in self.learners])
 
     def require_spaces(self) -> None:
-        """Refuse spaces that differ from the layouts, by looking at the first observation.
-
-        Raises:
-            UserError: names the agent, its numbers and those of the layout.
-        """
+        """Refuse spaces that differ from the layouts, by looking at the first observation."""
         task = self._task
         with self.naming("reset"):
             first, infos = self.start(0)
@@ -205,11 +193,7 @@ class Copy:
             raise UserError(f"the environment's state has {got} numbers, but the layout has {task.state.width}")
 
     def _require_alike(self, first: Mapping[Any, Any]) -> None:
-        """Refuse learning agents that see or do unlike things.
-
-        Raises:
-            UserError: names two of them.
-        """
+        """Refuse learning agents that see or do unlike things."""
         with self.naming("reading"):
             rows = ((name, self._task.reading(name, first[name])) for name in self.learners)
             seen = {name: foreign.numbers(row, f"what {name} sees").size for name, row in rows}
@@ -238,7 +222,6 @@ class Copy:
             return foreign.numbers(self.env.state(), "the state")
 
     def take(self) -> Array:
-        """Return the state of the simulator."""
         by_task = type(self._task).take is not CopyHooks.take
         row = self._task.take(self._task.own_of(self.env)) if by_task else self.simulator.read()
         return foreign.numbers(() if row is None else row, "what 'take' returns")
@@ -258,11 +241,7 @@ class Copy:
 
 
 def _require_round(task: CopyHooks, name: Any, box: tuple[Array, Array]) -> None:
-    """Refuse bounds that break the declared symmetry: a turn needs equal ones around 0, a mirror some around 0.
-
-    Raises:
-        UserError: names the field.
-    """
+    """Refuse bounds that break the declared symmetry: a turn needs equal ones around 0, a mirror some around 0."""
     assert isinstance(task.action, Continuous)
     turns, mirrors = (re.match(pattern, task.symmetry) for pattern in (_TURNS, _MIRRORS))
     low, high = box

@@ -32,7 +32,6 @@ class Attributes:
         self.layout, self._places = layout, places
 
     def read(self, bare: Any) -> Array:
-        """Return the numbers."""
         return np.array([np.ravel(_follow(bare, same[0][0]))[same[0][1]] for same in self._places])
 
     def write(self, bare: Any, numbers: Array) -> None:
@@ -51,13 +50,7 @@ class Attributes:
 
 
 class Simulator:
-    """The simulator inside of one environment, if it is of a known kind.
-
-    Args:
-        env: the environment, with any wrappers.
-        learners: names of the agents that learn.
-        attributes: where the state stands, of a simulator of no known kind.
-    """
+    """The simulator inside of an environment if it is of a known kind; else `attributes` say where its state stands."""
 
     def __init__(self, env: Any, learners: Sequence[Any], attributes: Attributes | None = None) -> None:
         self.bare, self._learners = getattr(env, "unwrapped", env), list(learners)
@@ -86,7 +79,6 @@ class Simulator:
         return np.asarray(state, float) if is_row else None
 
     def write(self, numbers: Array) -> None:
-        """Put it into a state."""
         bare, at = self.bare, 0
         numbers = np.array(numbers, float)
         if self._attributes is not None:

@@ -15,10 +15,9 @@ from pydantic import Field as Setting
 from torch import Tensor
 
 from esp_envs.adapters import require_attributes, seed_of
-from esp_envs.adapters.attributes import deciding_attributes
+from esp_envs.adapters.attributes import deciding_attributes, simulated_layout
 from esp_envs.adapters.copies import FINAL, NOW, TERMINATED, TRUNCATED, Board, Sizes, Stepper, WorkerCopies, can_fork
 from esp_envs.adapters.hooks import Array, Copy, CopyHooks
-from esp_envs.adapters.settable import simulated_layout
 from esp_envs.adapters.stepper import CopyStepper
 from esp_envs.base import Environment, Observation, Step, require_shape
 from esp_envs.errors import UserError
@@ -27,8 +26,7 @@ from esp_envs.scene import Scene
 from esp_envs.settings import TaskSettings
 from esp_envs.spec import ActionSpace, Discrete, Layout, TaskSpec, joint_layout
 
-_FEW_COPIES = 8
-"""Up to this number of copies, worker processes cost more time than they save."""
+_FEW_COPIES = 8  # up to this number of copies, worker processes cost more time than they save
 
 
 class ParallelSettings(TaskSettings):
@@ -95,7 +93,6 @@ class ParallelTask(CopyHooks, Environment):
         self._begun, self._time = torch.zeros_like(self._base), torch.zeros_like(self._base)
 
     def reset(self) -> Observation:
-        """Start a new episode in every copy."""
         drawn = [torch.randint(2**62, (self.num_envs,), generator=g, device=self.device) for g in self.generators]
         self._base = torch.stack(drawn).cpu()
         copies, everyone = self._started(), np.ones(self._base.numel(), bool)
@@ -108,11 +105,6 @@ class ParallelTask(CopyHooks, Environment):
         return self._seen()
 
     def step(self, action: Tensor) -> Step:
-        """Advance every copy by one step.
-
-        Raises:
-            UserError: the action has another shape, an environment raises, a worker dies, or agents end apart.
-        """
         require_shape("joint action", action, self.action_shape)
         copies = self._started()
         board = copies.board
@@ -151,10 +143,7 @@ class ParallelTask(CopyHooks, Environment):
         return self._simulated
 
     def has(self, method: str) -> bool:
-        """Return whether the task offers an optional method.
-
-        It has `set_state` where it is `settable`, and `scene` where copies of this process draw themselves.
-        """
+        """Return whether the task offers a method: `set_state` where `settable`, `scene` where its own copies draw."""
         if method == "scene" and type(self).scene is ParallelTask.scene:
             return self._draws and not self._processes()
         return self._simulated if method == "set_state" else super().has(method)
@@ -168,11 +157,6 @@ class ParallelTask(CopyHooks, Environment):
         return Scene((), (0.0, picture.shape[1], 0.0, picture.shape[0]), picture=picture)
 
     def set_state(self, state: Tensor) -> Observation:
-        """Put every copy into a state of its simulator, at the start of an episode.
-
-        Raises:
-            UserError: the state has another shape, or `settable` was not asked for or says no.
-        """
         if not self._simulated:
             return super().set_state(state)
         require_shape("state", state, self.state_shape)
@@ -184,7 +168,6 @@ class ParallelTask(CopyHooks, Environment):
         return self._seen()
 
     def _started(self) -> Stepper:
-        """Return the copies, made when they are first needed."""
         if self._copies is None:
             count, workers = self._base.numel(), self._processes()
             spec, discrete = self.spec, isinstance(self.action, Discrete)
@@ -215,12 +198,10 @@ class ParallelTask(CopyHooks, Environment):
         return CopyStepper(self, board, copies, self._simulated)
 
     def _seeds(self, which: Array) -> list[int]:
-        """Return the seed of the next episode of some copies; no copy's depends on the others."""
         base, episode = self._base.flatten().numpy()[which], self._begun.flatten().numpy()[which]
         return list(map(seed_of, base.tolist(), episode.tolist()))
 
     def action_mask(self) -> Tensor | None:
-        """Return which actions each agent may take now; None without `masks`."""
         return self._per_world(self._started().board.mask[NOW]).bool() if self.masks else None
 
     def _seen(self, when: int = NOW) -> Observation:
@@ -229,5 +210,4 @@ class ParallelTask(CopyHooks, Environment):
         return Observation(obs, state, mask.bool() if self.masks else None, alive.bool() if self.agents_end else None)
 
     def _per_world(self, values: Array) -> Tensor:
-        """Return [S, E, ...] on the task's device, as memory of its own."""
         return torch.from_numpy(values.copy()).view(*self._base.shape, *values.shape[1:]).to(self.device)

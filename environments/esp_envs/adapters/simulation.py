@@ -16,11 +16,7 @@ from esp_envs.spec import Field, Items, Kind, Layout
 
 
 def maker(scenario: Any, num_envs: int, device: torch.device, arguments: Mapping[str, object]) -> Callable[[], Any]:
-    """Return what makes one simulator.
-
-    Raises:
-        UserError: VMAS is missing, or the scenario does not take the arguments.
-    """
+    """Return what makes one simulator."""
     try:
         import vmas  # noqa: PLC0415 - an extra
     except ImportError as error:
@@ -43,11 +39,7 @@ def maker(scenario: Any, num_envs: int, device: torch.device, arguments: Mapping
 
 
 def rows(given: Sequence[Any], what: str, num_envs: int, width: int | None = None) -> Tensor:
-    """Return what a scenario gives each agent as [E, N, width].
-
-    Raises:
-        UserError: an agent gets something else than that many numbers in each world, or other numbers than the first.
-    """
+    """Return what a scenario gives each agent as [E, N, width]."""
     for k, one in enumerate(given):
         is_tensor = isinstance(one, Tensor) and one.ndim > 0
         wanted = [num_envs, one.shape[-1] if width is None and is_tensor and k == 0 else width or 0]
@@ -59,11 +51,7 @@ def rows(given: Sequence[Any], what: str, num_envs: int, width: int | None = Non
 
 
 def force_of(agent: Any) -> float:
-    """Return the full force of an agent.
-
-    Raises:
-        UserError: it acts by something else than a force in the plane that has one range.
-    """
+    """Return the full force of an agent, which has to act by a force in the plane of one range."""
     if agent.action_size != 2 or torch.as_tensor(agent.u_range).numel() != 1 or not agent.silent:
         raise UserError(f"agent {agent.name} acts by other numbers than a force in the plane with one u_range")
     return float(agent.u_range)
@@ -91,13 +79,7 @@ class RandomNumbers:
 
 
 class Entities:
-    """The entities of a simulator as the global state.
-
-    Args:
-        sim: a simulator of the scenario.
-        own_goals: what the names of landmarks begin with that belong to one agent each.
-        flags: attributes of landmarks that are 0 or 1 for each world.
-    """
+    """The entities of a simulator as the global state."""
 
     def __init__(self, sim: Any, own_goals: str, flags: Sequence[str]) -> None:
         landmarks = sim.world.landmarks
@@ -146,22 +128,20 @@ class Entities:
                     setattr(entities[i], what, part.view_as(flag).to(flag.dtype))
 
     def _add(self, name: str, sim: Any, group: int, index: list[int], items: Items) -> None:
-        """Add the columns of some entities that are alike."""
         if not index:
             return
         first = _of(sim)[group][index[0]]
         columns = [("pos", "position", Kind.VECTOR, "length")]
         if first.movable:
             columns.append(("vel", "velocity", Kind.VECTOR, "length/s"))
-        if first.rotatable and not _is_round(first):
+        if first.rotatable and type(first.shape).__name__ != "Sphere":
             columns.append(("rot", "heading", Kind.VECTOR, "direction"))
             columns.append(("ang_vel", "spin", Kind.PSEUDOSCALAR, "rad/s"))
         for what, word, kind, unit in columns:
             self._columns.append((Field(f"{name}.{word}", kind, len(index), unit, items), group, index, what))
 
 
-_STATE = ("pos", "vel", "rot", "ang_vel")
-"""What an entity's state holds; anything else is a flag of the entity itself."""
+_STATE = ("pos", "vel", "rot", "ang_vel")  # what an entity's state holds; anything else is a flag of the entity itself
 
 
 _AGENTS, _LANDMARKS, _SCRIPTED = 0, 1, 2
@@ -170,7 +150,3 @@ _AGENTS, _LANDMARKS, _SCRIPTED = 0, 1, 2
 def _of(sim: Any) -> tuple[Sequence[Any], ...]:
     """Return the agents of a simulator, its landmarks, and agents that follow a script."""
     return sim.agents, sim.world.landmarks, [agent for agent in sim.world.agents if agent not in sim.agents]
-
-
-def _is_round(entity: Any) -> bool:
-    return type(entity.shape).__name__ == "Sphere"

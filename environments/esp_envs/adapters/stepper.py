@@ -15,14 +15,7 @@ from esp_envs.errors import UserError
 
 
 class CopyStepper:
-    """Steps some copies of a board.
-
-    Args:
-        task: what it says of its copies.
-        board: of all copies.
-        copies: which ones.
-        simulated: whether the state is that of the simulator.
-    """
+    """Steps some copies of a board, whose state is that of the simulator where they are `simulated`."""
 
     def __init__(self, task: CopyHooks, board: Board, copies: range, simulated: bool = False) -> None:
         self._task, self.board, self._simulated = task, board, simulated
@@ -37,7 +30,6 @@ class CopyStepper:
         self._whole: set[int] = set()  # copies that have ended an episode while a metric was lost
 
     def reset(self) -> None:
-        """Start an episode in every copy."""
         for k in self._copies:
             self._start(k)
 
@@ -148,7 +140,6 @@ class CopyStepper:
                 raise UserError(f"'step' does not say whether {name} {of_task} has ended; give it both flags")
 
     def _paid(self, name: Any, reward: Mapping[Any, Any], left: bool) -> float:
-        """Return an agent's reward; 0 for one that has left without a word."""
         if name not in reward and not left:
             raise UserError(f"'step' gives {name} of {type(self._task).__name__} no reward; give one to all that acted")
         return float(foreign.numbers(reward[name], f"the reward of {name}", 1)[0]) if name in reward else 0.0

@@ -110,7 +110,6 @@ class VmasTask(Environment):
             )
 
     def reset(self) -> Observation:
-        """Start a new episode in every world."""
         for s, generator in enumerate(self.generators):
             self._base[s] = torch.randint(2**31, (), generator=generator, device=self.device)
             self._numbers[s] = simulation.RandomNumbers(int(self._base[s]))
@@ -118,11 +117,6 @@ class VmasTask(Environment):
         return _joined([self._begin(s) for s in range(self.num_seeds)])
 
     def step(self, action: Tensor) -> Step:
-        """Advance every world by one step.
-
-        Raises:
-            UserError: the action has another shape than [S, E, N, 2].
-        """
         require_shape("joint action", action, self.action_shape)
         force = self.spec.action.admissible(action) * self._range.unsqueeze(-1)
         reached, following, rewards, ends, measured = [], [], [], [], []
@@ -152,11 +146,6 @@ class VmasTask(Environment):
         )
 
     def set_state(self, state: Tensor) -> Observation:
-        """Put every world into a global state at the start of an episode.
-
-        Raises:
-            UserError: the state has another shape than [S, E, state width].
-        """
         require_shape("state", state, self.state_shape)
         self._time.zero_()
         parts = []
@@ -173,14 +162,12 @@ class VmasTask(Environment):
         return _joined(parts)
 
     def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
-        """Return every entity of one world as a disc or a square of its colour."""
         sim = self._sims[world[0]]
         bodies = [_body(entity, world[1], entity in sim.agents) for entity in [*sim.world.landmarks, *sim.agents]]
         half = 1.2 * max(1.0, float(sim.world.x_semidim or 1), float(sim.world.y_semidim or 1))
         return Scene(tuple(bodies), (-half, half, -half, half))
 
     def _begin(self, s: int) -> Observation:
-        """Start the next episode in all worlds of one seed, which are at the same episode."""
         sim, seed = self._sims[s], seed_of(int(self._base[s]), int(self._begun[s, 0]))
         with simulation.RandomNumbers(seed).drawn():
             obs = sim.reset(seed=seed)

@@ -49,7 +49,6 @@ class Navigation(VmasTask):
         super().__init__(*arguments)  # type: ignore[arg-type]
 
     def seen(self) -> Layout:
-        """Return the layout of one agent's observation."""
         rays = self.settings.rays
         lidar = (Field("lidar", Kind.RING, unit="length", rays=rays),) if rays else ()
         return layout(*_OWN, Field("from_goal", Kind.VECTOR, unit="length"), *lidar)
@@ -71,7 +70,6 @@ class Transport(VmasTask):
     terminates, shared_reward = True, True
 
     def seen(self) -> Layout:
-        """Return the layout of one agent's observation."""
         package = (
             Field("from_goal", Kind.VECTOR, unit="length"),
             Field("offset", Kind.VECTOR, unit="length"),
@@ -98,7 +96,6 @@ class Balance(VmasTask):
     terminates, shared_reward, metrics = True, True, ("ground_rew",)
 
     def seen(self) -> Layout:
-        """Return the layout of one agent's observation."""
         return layout(
             *_OWN,
             Field("from_package", Kind.VECTOR, unit="length"),
@@ -139,11 +136,9 @@ class Dispersion(VmasTask):
     terminates = True
 
     def arguments(self) -> dict[str, object]:
-        """Return the scenario's arguments."""
         return super().arguments() | {"n_food": self.settings.food}
 
     def seen(self) -> Layout:
-        """Return the layout of one agent's observation."""
         piece = (Field("offset", Kind.VECTOR, unit="length"), Field("eaten", Kind.SCALAR, unit="0 or 1"))
         return layout(*_OWN, Field("food", Kind.RECORD, self.settings.food, parts=piece, family="food"))
 
@@ -155,16 +150,7 @@ def _vectors(*names: str) -> tuple[Field, ...]:
 def _scenario(
     name: str, symmetry: str, *seen: Field, agents: int, fixed: bool = False, **attributes: object
 ) -> type[VmasTask]:
-    """Return the task of a scenario.
-
-    Args:
-        name: the scenario's.
-        symmetry: what holds of it.
-        seen: fields of an agent's observation.
-        agents: of the team.
-        fixed: whether the scenario takes no other number of them.
-        attributes: further ones of the class.
-    """
+    """Return the task of a scenario; where it is `fixed`, it takes no other number of agents."""
     settings = type("Settings", (VmasSettings,), {"__annotations__": {"num_agents": int}, "num_agents": agents})
     members: dict[str, object] = {"Settings": settings, "scenario": name, "symmetry": symmetry, "terminates": True}
     members |= {"convention": f"vmas {name}", "seen": lambda _: layout(*seen), "__module__": __name__}

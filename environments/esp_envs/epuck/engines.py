@@ -16,11 +16,7 @@ ENGINES = {
 
 
 def make_physics(name: str, arena: Arena, num_worlds: int, control_period_s: float, num_threads: int = 1) -> Physics:
-    """Make W worlds in the engine `name`.
-
-    Raises:
-        UserError: no such engine, or its library is not installed.
-    """
+    """Make W worlds in the engine `name`; refuse one that is unknown or whose library is missing."""
     if name not in ENGINES:
         raise UserError(f"unknown physics '{name}'; there are {', '.join(ENGINES)}")
     forget_missing_backend()

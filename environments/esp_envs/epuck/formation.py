@@ -111,7 +111,6 @@ class Formation(BatchedTask):
         return formation_spec(self.settings)
 
     def _furnish(self) -> None:
-        """Put goals and pillars where the arena has them."""
         self._goals, self._pillars = -self._posts, np.tile(self.arena.pillars(), (self.num_worlds, 1, 1))
 
     def _start(self, generator: torch.Generator) -> World:
@@ -138,7 +137,6 @@ class Formation(BatchedTask):
         self._place(pose, np.zeros_like(pose))
 
     def _place(self, pose: Array, velocity: Array) -> None:
-        """Begin an episode with the robots here."""
         self._pending[:], self._arrived[:] = 0, False
         self.physics.place(Bodies(pose, velocity, self._pillars, self._mass, self._friction))
         self._look()
@@ -237,12 +235,10 @@ class Formation(BatchedTask):
         return self._heading + self.settings.heading_noise_rad * noise[..., 0], seen + offsets
 
     def _per_world(self, values: Array) -> Tensor:
-        """Return float32 [S, E, ...] on the task's device from [W, ...]."""
         shaped = torch.from_numpy(values.astype(np.float32)).view(self.num_seeds, self.num_envs, *values.shape[1:])
         return shaped.to(self.device)
 
     def _put(self, state: Tensor) -> None:
-        """Write a state, with nominal masses, grip and wheels."""
         rows = state.double().cpu().numpy().reshape(self.num_worlds, -1)
         where = self.spec.state.slices()
 
@@ -284,13 +280,11 @@ class Formation(BatchedTask):
         return self._per_world(wheels)
 
     def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
-        """Return goals, pillars and robots of one world (seed index, world index)."""
         w = world[0] * self.num_envs + world[1]
         places = (self._goals[w], self._pillars[w], self._position[w], self._heading[w])
         return rules.formation_scene(self.settings, *places)
 
     def painter(self, size: int) -> AbstractContextManager[Painter]:
-        """Open the view in space, with pictures `size` pixels wide."""
         return open_painter(size)
 
 

@@ -36,10 +36,7 @@ def nearest(apart: Array, ways: Array, count: int) -> Array:
 
 
 def nearness(offset: Array, reach_m: float) -> Array:
-    """Return the direction of a body, of length exp(-gap / 0.2 m): 1 where it touches.
-
-    The offset [..., 2] is between the centres; at the distance `reach_m` the bodies touch.
-    """
+    """Return the direction of a body [..., 2], of length exp(-gap / 0.2 m): 1 where centres are `reach_m` apart."""
     distance = np.maximum(length(offset), 1e-9)[..., None]
     return offset / distance * np.exp(-np.maximum(distance - reach_m, 0) / FADING_M)
 
@@ -65,13 +62,7 @@ def step_reward(settings: FormationSettings, progress: Array, apart: Array) -> A
 
 
 def towards(wish: Array, heading: Array, control_period_s: float) -> Array:
-    """Return wheel speeds, [W, N, 2] in [-1, 1], that turn to a wished way and drive along it.
-
-    Args:
-        wish: [W, N, 2] m; shorter ones than a control period's full speed are driven more slowly.
-        heading: [W, N] rad.
-        control_period_s: time until the next choice.
-    """
+    """Return wheel speeds, [W, N, 2] in [-1, 1], that turn to a wish [W, N, 2] m and drive along it."""
     error = np.arctan2(wish[..., 1], wish[..., 0]) - heading
     error = np.remainder(error + math.pi, 2 * math.pi) - math.pi
     reach = length(wish) / (MAX_SPEED_M_S * control_period_s)

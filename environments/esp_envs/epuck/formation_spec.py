@@ -91,7 +91,6 @@ class FormationSettings(TaskSettings):
     )
 
     def without_effect(self) -> frozenset[str]:
-        """Return the names of settings that change nothing beside the others."""
         return frozenset({"obstacle_radius_m"} if self.num_obstacles == 0 else ())
 
     @property
@@ -111,12 +110,10 @@ class FormationSettings(TaskSettings):
 
     @property
     def goal_unit(self) -> str:
-        """Unit in which the goal is seen."""
         return "m" if self.goal_sight_m is None else f"{self.goal_sight_m:g} m, at most 1"
 
     @property
     def seen_robots(self) -> int:
-        """Robots that an observation shows."""
         return min(self.neighbours, self.num_agents - 1)
 
     @property
@@ -133,7 +130,6 @@ class FormationSettings(TaskSettings):
 
     @property
     def arena(self) -> Arena:
-        """The arena that these settings describe."""
         return Arena(self.arena_m, self.num_agents, self.num_obstacles, self.obstacle_radius_m)
 
     @model_validator(mode="after")

@@ -43,9 +43,6 @@ def forget_missing_backend() -> None:
 
     `import mujoco` would otherwise fail with "'NoneType' object has no attribute 'glGetError'", even for training,
     which draws nothing. To be called before MuJoCo is imported.
-
-    Raises:
-        UserError: it names what MuJoCo refuses on this system.
     """
     named = os.environ.get("MUJOCO_GL", "").strip().lower()
     known = _OF_SYSTEM.get(sys.platform, ())
@@ -94,7 +91,6 @@ def _choose_library() -> None:
 
 
 def _draw_with(backend: str) -> None:
-    """Make a library MuJoCo's own, and prepare a first picture with it."""
     mujoco = import_module("mujoco")
     chosen = import_module(mujoco.Renderer.__module__).gl_context  # by default what MUJOCO_GL named at the import
     chosen.GLContext = import_module(f"mujoco.{backend}").GLContext

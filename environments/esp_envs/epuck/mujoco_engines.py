@@ -55,7 +55,6 @@ class MujocoWorlds(Physics):
         """Build one world: walls, robots, pillars."""
 
     def place(self, bodies: Bodies) -> None:
-        """Put every world into this state."""
         self._move(bodies.pose, bodies.velocity)
         self._warmstart[:] = 0.0
         if self.arena.num_pillars:
@@ -67,7 +66,6 @@ class MujocoWorlds(Physics):
         """Write every robot's planar pose and velocity ([W, N, 3] each) into the joints."""
 
     def _make_of(self, mass: Array, friction: Array) -> None:
-        """Give every robot its own mass and grip."""
         if np.array_equal(mass, self._mass) and np.array_equal(friction, self._friction):
             return
         self._mass, self._friction = mass.copy(), friction.copy()
@@ -85,21 +83,13 @@ class MujocoWorlds(Physics):
         """Fit the wheels to mass and friction [W, N], which are multiples of a robot's own."""
 
     def load_state_dict(self, arrays: dict[str, Array]) -> None:
-        """Write the arrays into the batch."""
         for name in self.remembered[:4]:
             getattr(self, f"_{name}")[:] = arrays[name]
         self._make_of(arrays["mass"], arrays["friction"])
 
 
 def _compiled(arena: Arena, option: str, floor: str, robots: list[tuple[str, str]]) -> mujoco.MjModel:
-    """Build one world.
-
-    Args:
-        arena: its walls and pillars.
-        option: attributes of MuJoCo's options.
-        floor: element of the floor, if any.
-        robots: elements of each robot's body and of its servos.
-    """
+    """Build one world of its arena, MuJoCo's options, the floor if any, and the robots' bodies and servos."""
     half, towards = arena.side_m / 2, float(np.sqrt(0.5))
     # The z axis of a plane points out of the wall; each quaternion turns (0, 0, 1) to (x, y, 0).
     walls = [
@@ -162,7 +152,6 @@ class MujocoPlanar(MujocoWorlds):
         self._batch.expand("actuator_forcerange")[:] = self.model.actuator_forcerange * grip
 
     def advance(self, wheels: Array) -> None:
-        """Drive for one control period."""
         self._control[:] = chord(wheels, self._qpos[..., 2], self.control_period_s)
         self._batch.step(nstep=self._substeps)
 
@@ -219,7 +208,6 @@ class MujocoSpatial(MujocoWorlds):
         self._batch.expand("geom_friction")[:, self._wheels, 0] = FRICTION * np.repeat(friction, 2, axis=1)
 
     def advance(self, wheels: Array) -> None:
-        """Drive for one control period."""
         self._control[:] = wheels
         self._batch.step(nstep=self._substeps)
 

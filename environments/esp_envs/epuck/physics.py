@@ -33,17 +33,7 @@ class Bodies:
 
 
 class Physics(ABC):
-    """W worlds of N robots and M pillars in one arena, in float64 on the CPU.
-
-    Args:
-        arena: walls, and the number and size of everything.
-        num_worlds: W.
-        control_period_s: simulated time of one `advance`.
-        num_threads: threads to step with, where the engine can.
-
-    Raises:
-        UserError: the period is not a multiple of the time step.
-    """
+    """W worlds of N robots and M pillars in one arena, in float64 on the CPU."""
 
     remembered: ClassVar[tuple[str, ...]]
     """Names of the arrays that a world's future depends on; the attributes have an underscore before them."""
@@ -64,11 +54,7 @@ class Physics(ABC):
 
     @abstractmethod
     def advance(self, wheels: Array) -> None:
-        """Drive for one control period.
-
-        Args:
-            wheels: [W, N, 2] left and right wheel speed, rad/s.
-        """
+        """Drive for one control period at wheel speeds [W, N, 2], left and right, rad/s."""
 
     @property
     def pose(self) -> Array:

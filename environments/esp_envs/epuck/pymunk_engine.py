@@ -58,7 +58,6 @@ class PymunkPlanar(Physics):
         self._mass = self._friction = np.ones((num_worlds, arena.num_robots))
 
     def _space(self) -> pymunk.Space:
-        """Build one world: robots, then pillars, then walls."""
         space, side = pymunk.Space(), self.arena.side_m
         space.iterations, space.collision_slop, space.collision_persistence = ITERATIONS, CONTACT_SLOP_M, 1
         # In cells as large as the arena every shape is compared with every other, which for a dozen is fastest.
@@ -77,7 +76,6 @@ class PymunkPlanar(Physics):
         return space
 
     def place(self, bodies: Bodies) -> None:
-        """Put every world into this state."""
         self._pose[:], self._velocity[:], self._pillars[:] = bodies.pose, bodies.velocity, bodies.pillars
         changed = np.argwhere(bodies.mass != self._mass)
         for world, index in changed:
@@ -86,7 +84,6 @@ class PymunkPlanar(Physics):
         self._mass, self._friction = bodies.mass.copy(), bodies.friction.copy()
 
     def advance(self, wheels: Array) -> None:
-        """Drive for one control period."""
         self._force[:] = self._push(wheels)
         steps = range(self._substeps)
         for space, buffer in zip(self._spaces, self._buffers, strict=True):
@@ -99,10 +96,7 @@ class PymunkPlanar(Physics):
             get_space_bodies(space, _FIELDS, buffer)
 
     def _push(self, wheels: Array) -> Array:
-        """Return forces and torques [W, N, 3] that change the velocities to those of the wheels in one time step.
-
-        All together they push no more than friction can in a control period.
-        """
+        """Return forces and torques [W, N, 3] that change the velocities to those of the wheels in one time step."""
         # Chipmunk moves bodies first and changes their velocities then: what is asked for acts one time step later.
         heading = self._pose[..., 2] + self._velocity[..., 2] * TIMESTEP_S
         change = chord(wheels, heading, self.control_period_s) - self._velocity
@@ -114,7 +108,6 @@ class PymunkPlanar(Physics):
         return change * self._mass[..., None] * [MASS_KG, MASS_KG, _INERTIA] / TIMESTEP_S
 
     def load_state_dict(self, arrays: dict[str, Array]) -> None:
-        """Place the bodies."""
         self.place(Bodies(**arrays))
 
 

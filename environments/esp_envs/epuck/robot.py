@@ -39,11 +39,7 @@ DIMENSIONS = {
 
 
 def drive(wheels: Array) -> tuple[Array, Array]:
-    """Return forward speed (m/s) and turning rate (rad/s, counter-clockwise) of wheels that do not slip.
-
-    Args:
-        wheels: [..., 2] left and right wheel speed, rad/s.
-    """
+    """Return speed (m/s) and turning rate (rad/s, counter-clockwise) of wheels [..., 2] (rad/s) that do not slip."""
     rim = wheels * WHEEL_RADIUS_M
     return (rim[..., 0] + rim[..., 1]) / 2, (rim[..., 1] - rim[..., 0]) / AXLE_M
 

@@ -105,11 +105,7 @@ class SpacePainter:
         self._renderer: mujoco.Renderer | None = None
 
     def draw(self, scene: Scene, trail: Sequence[Scene] = ()) -> NDArray[np.uint8]:
-        """Draw one scene, whose window is the floor between the walls; see `esp_envs.scene.Painter`.
-
-        Raises:
-            UserError: the window is empty, or a body has an unknown model or none.
-        """
+        """Draw one scene, whose window is the floor between the walls; see `esp_envs.scene.Painter`."""
         looks = scene.window, [(body.model, body.radius, body.color) for body in scene.bodies]
         if self._renderer is None or looks != self._looks:
             self._renderer, self._looks = self._build(scene), looks
@@ -124,7 +120,6 @@ class SpacePainter:
         return picture
 
     def close(self) -> None:
-        """Free what the renderer holds."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
@@ -175,7 +170,6 @@ def _add_triangle(
 
 
 def _thinned(path: Sequence[tuple[float, float]], step: float) -> list[tuple[float, float]]:
-    """Return the points of a path that are at least a step from the one before, and its end."""
     kept = [path[0]]
     for point in path[1:-1]:
         if math.dist(point, kept[-1]) >= step:
@@ -184,13 +178,7 @@ def _thinned(path: Sequence[tuple[float, float]], step: float) -> list[tuple[flo
 
 
 def model_of(scene: Scene, width: int, height: int) -> mujoco.MjModel:
-    """Build floor, walls, light, and one mocap body per body of the scene, in their order.
-
-    The picture is `width` times `height` pixels; the scene's window is the floor between the walls, m.
-
-    Raises:
-        UserError: the window is empty, or a body has an unknown model or none.
-    """
+    """Build floor, walls, light, and one mocap body per body of the scene, in their order."""
     x_min, x_max, y_min, y_max = scene.window
     if x_max <= x_min or y_max <= y_min:
         raise UserError(f"cannot draw the window {scene.window}; use a real window")
@@ -219,7 +207,6 @@ def model_of(scene: Scene, width: int, height: int) -> mujoco.MjModel:
 
 
 def _add_arena(world: mujoco.MjsBody, window: tuple[float, float, float, float]) -> None:
-    """Add the floor with grid lines as in the view from above, and walls around it."""
     x_min, x_max, y_min, y_max = window
     x, y = (x_min + x_max) / 2, (y_min + y_max) / 2
     half_x, half_y, half_wall = (x_max - x_min) / 2, (y_max - y_min) / 2, WALL_WIDTH_M / 2
@@ -239,7 +226,6 @@ def _add_arena(world: mujoco.MjsBody, window: tuple[float, float, float, float])
 
 
 def _add_robot(place: mujoco.MjsBody, body: Body) -> None:
-    """Add an e-puck on two wheels: a dark case under a plate of the body's colour, with a nose mark."""
     scale = body.radius / BODY_RADIUS_M
     height, wheel = BODY_HEIGHT_M * scale, WHEEL_RADIUS_M * scale
     plate = height / 8
@@ -260,7 +246,6 @@ def _add_pillar(place: mujoco.MjsBody, body: Body) -> None:
 
 
 def _add_goal(place: mujoco.MjsBody, body: Body) -> None:
-    """Add a ring on the floor."""
     _add(place, _Cylinder, [body.radius, _LAYER_M, 0], [0, 0, 0], body.color)
     _add(place, _Cylinder, [body.radius * 0.65, _LAYER_M, 0], [0, 0, _LAYER_M], BACKGROUND)
 
@@ -276,7 +261,6 @@ def _add(
     color: str,
     quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
 ) -> None:
-    """Add one geom that touches nothing."""
     rgba = [*(level / 255 for level in ImageColor.getrgb(color)[:3]), 1.0]
     place.add_geom(
         type=shape, size=size, pos=at, quat=quat, rgba=rgba, material="matt", contype=0, conaffinity=0, mass=0

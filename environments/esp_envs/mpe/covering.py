@@ -14,8 +14,7 @@ LOOKAHEAD_S = 0.2
 """Time over which the present velocity is taken to carry an agent on; found by search, it brakes in time."""
 FULL_FORCE_DISTANCE = 0.2
 """How far one step of full force carries an agent in all (0.5 length/s, fading by a quarter a step, 0.1 s each)."""
-MAX_SHARINGS = 4096
-"""Most ways of sharing out landmarks that `shared_out` should try."""
+MAX_SHARINGS = 4096  # most ways of sharing out landmarks that `shared_out` should try
 MOST_ASSIGNED = 2000
 """Agents or landmarks up to which `assigned` shares them out by the Hungarian method, whose time is cubic."""
 TRAVEL_WEIGHT = 0.25
@@ -28,15 +27,7 @@ def approach(goal: Tensor, position: Tensor, velocity: Tensor) -> Tensor:
 
 
 def one_each(position: Tensor, landmark: Tensor) -> Tensor:
-    """Give each agent a landmark of its own: the nearest free pair first, then swaps that shorten the way.
-
-    Args:
-        position: [N, 2, W].
-        landmark: [L, 2, W].
-
-    Returns:
-        The goals [N, 2, W]; agents left over when all landmarks are taken stay where they are.
-    """
+    """Give each agent [N, 2, W] a landmark [L, 2, W]: the nearest free pair first, then swaps; others stay."""
     agents, landmarks = position.shape[0], landmark.shape[0]
     distance = (position.unsqueeze(1) - landmark.unsqueeze(0)).norm(dim=2)
     idle = distance.new_zeros(agents, max(agents - landmarks, 0), distance.shape[-1])
@@ -52,17 +43,10 @@ def one_each(position: Tensor, landmark: Tensor) -> Tensor:
 
 
 def assigned(position: Tensor, landmark: Tensor) -> Tensor:
-    """Give each agent a landmark of its own so that the sum of distances is least (Hungarian method).
+    """Give each agent a landmark of its own so that the sum of distances is least (Hungarian method); see `one_each`.
 
     With more than `MOST_ASSIGNED` of them an agent takes the nearest landmark that no nearer agent wants, round after
     round.
-
-    Args:
-        position: [N, 2, W].
-        landmark: [L, 2, W].
-
-    Returns:
-        The goals [N, 2, W]; agents left over when all landmarks are taken stay where they are.
     """
     from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 - few need it, and it takes long to import
 
@@ -94,11 +78,7 @@ def _wanted_most(here: Tensor, there: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _nearest_pairs_first(distance: Tensor) -> Tensor:
-    """Return the landmark index [N, W] of each agent; agents left over get L, L + 1, ...
-
-    Args:
-        distance: [N, L, W].
-    """
+    """Return by distances [N, L, W] the landmark index [N, W] of each agent; agents left over get L, L + 1, ..."""
     agents, landmarks, worlds = distance.shape
     agent_index = torch.arange(agents, device=distance.device).view(-1, 1, 1)
     target_index = torch.arange(landmarks, device=distance.device).view(1, -1, 1)
@@ -119,10 +99,7 @@ def shared_out(position: Tensor, landmark: Tensor) -> Tensor:
     An agent with one landmark goes to it; with two, to the nearest point between them (every point of the segment has
     the same sum of distances); with more, to the one of them with the least sum of distances. Among all sharings the
     one with the least remaining distance plus TRAVEL_WEIGHT times the distance to travel is taken.
-
-    Args:
-        position: [N, 2, W].
-        landmark: [L, 2, W]; N^L ways are tried, for which `MAX_SHARINGS` is a good limit.
+    N^L ways are tried, for which `MAX_SHARINGS` is a good limit.
     """
     agents, landmarks = position.shape[0], landmark.shape[0]
     places, costs = _places(position, landmark)

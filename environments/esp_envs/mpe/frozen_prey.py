@@ -29,11 +29,7 @@ _MOST_BYTES = 1 << 26
 
 
 class FrozenPrey:
-    """Greedy moves of a learned prey.
-
-    Raises:
-        UserError: the file is missing, damaged, of something else, or does not fit the task.
-    """
+    """Greedy moves of a learned prey; a file that is missing, damaged or of another task is refused."""
 
     def __init__(self, path: str, seed: int, num_inputs: int, num_actions: int, device: torch.device) -> None:
         header, tensors = _read(path)
@@ -47,14 +43,7 @@ class FrozenPrey:
             )
 
     def moves(self, observation: Tensor) -> Tensor:
-        """Return the move with the largest logit.
-
-        Args:
-            observation: [W, D].
-
-        Returns:
-            [W] int64.
-        """
+        """Return the move with the largest logit [W] int64 at observations [W, D]."""
         hidden = observation
         for index, (weight, bias) in enumerate(self.layers):
             if index:
@@ -64,7 +53,6 @@ class FrozenPrey:
 
 
 def _read(path: str) -> tuple[dict[str, object], dict[str, Tensor]]:
-    """Return the JSON header and the actor's tensors of a policy file."""
     if not Path(path).is_file():
         raise UserError(f"there is no prey policy file at {path}; give the path of an exported prey policy")
     if Path(path).stat().st_size > _MOST_BYTES:
@@ -147,6 +135,5 @@ def _canonical(value: Any) -> bytes:
 
 
 def _short(value: object) -> str:
-    """Return the first line of a text, cut to a length that fits into a sentence."""
     text = next(iter(str(value).splitlines()), "")
     return text if len(text) <= 80 else f"{text[:77]}..."

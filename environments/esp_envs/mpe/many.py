@@ -9,12 +9,9 @@ from esp_envs.mpe.particles import CONTACT_MARGIN, Bodies, ParticleWorlds, conta
 
 MOST_BODIES = 8
 """Agents up to which pairs are listed and observations are one matrix product, which is faster for few of them."""
-BY_TREE = 200
-"""Agents from which on the near ones are found by a tree, on the CPU: N log N, where all pairs are N^2."""
-_PAIRS = 1 << 21
-"""Pairs that are looked at together."""
-_NO_PUSH = 60 * CONTACT_MARGIN
-"""Gap between two rims from which on a push is 0 in float32."""
+BY_TREE = 200  # agents from which on the near ones are found by a tree, on the CPU: N log N, where all pairs are N^2
+_PAIRS = 1 << 21  # pairs that are looked at together
+_NO_PUSH = 60 * CONTACT_MARGIN  # gap between two rims from which on a push is 0 in float32
 
 
 class ManyWorlds(ParticleWorlds):
@@ -95,7 +92,6 @@ class ManyWorlds(ParticleWorlds):
         return torch.cat([torch.full((1, len(pairs)), world), pairs.t()])
 
     def _contact_impulses(self) -> Tensor:
-        """Return the velocity change [A, 2, W'] that contacts cause in one step."""
         (world, first, second), position = self._near, self.position
         offset = position[first, :, world] - position[second, :, world]
         padding = (0, -len(offset) % 64)  # vector code and its scalar tail round otherwise

@@ -20,12 +20,9 @@ from esp_envs.scene import COLORS, Body, Scene
 from esp_envs.spec import Field, Items, Kind, TaskSpec, filled_layout, layout
 
 AGENT_RADIUS = 0.15
-_LANDMARK_RADIUS = 0.05
-"""For drawing only: landmarks touch nothing."""
-SENSITIVITY = 5.0
-"""Acceleration of a full force, length / s^2."""
-OCCUPIED_WITHIN = 0.1
-"""A landmark counts as covered when an agent's centre is nearer than this (mpe2's capture radius)."""
+_LANDMARK_RADIUS = 0.05  # for drawing only: landmarks touch nothing
+SENSITIVITY = 5.0  # acceleration of a full force, length / s^2
+OCCUPIED_WITHIN = 0.1  # a landmark counts as covered when an agent's centre is nearer than this (mpe2's capture radius)
 LANDMARK_EXTENT = {"esp": 0.8, "pettingzoo": 1.0}
 _LANDMARK_COLOR = "#404040"
 
@@ -60,12 +57,10 @@ class NavigationSettings(ParticleSettings):
 
     @property
     def landmarks(self) -> int:
-        """L with its default filled in."""
         return self.num_landmarks or (3 if self.num_agents == 2 else self.num_agents)
 
     @property
     def extent(self) -> float:
-        """The landmark extent with its default filled in."""
         return self.landmark_extent or (self.half_side if self.density else LANDMARK_EXTENT[self.convention])
 
     @property
@@ -85,7 +80,6 @@ class NavigationSettings(ParticleSettings):
         return self.sees > 0 or self.num_agents > MOST_BODIES
 
     def without_effect(self) -> frozenset[str]:
-        """Return the names of settings that change nothing beside the others."""
         return frozenset({"local_ratio"} if self.convention == "esp" else ())
 
 
@@ -236,7 +230,6 @@ class Navigation(ParticleTask):
         return self._to_action(covering.approach(goal, position, worlds.velocity))
 
     def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
-        """Return agents, and landmarks on top of them, of one world."""
         lane = world[0] * self.num_envs + world[1]
         places = self.worlds.entity[:, :, lane].tolist()
         agents = self.settings.num_agents

@@ -24,14 +24,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-DT_S = 0.1
-"""Simulated seconds of one step."""
-DAMPING = 0.25
-"""Share of the velocity lost in one step."""
-CONTACT_FORCE = 1e2
-"""Stiffness of a contact, force per length of overlap."""
-CONTACT_MARGIN = 1e-3
-"""Length over which a contact fades in."""
+DT_S = 0.1  # simulated seconds of one step
+DAMPING = 0.25  # share of the velocity lost in one step
+CONTACT_FORCE = 1e2  # stiffness of a contact, force per length of overlap
+CONTACT_MARGIN = 1e-3  # length over which a contact fades in
 
 LANE_MULTIPLE = 64
 """The worlds axis is padded to a multiple of this, so that vector code never runs a scalar tail: the numbers of a world
@@ -161,12 +157,7 @@ def lanes_of(num_worlds: int) -> int:
 
 
 def contact_strength(squared_distance: Tensor, touching: Tensor) -> Tensor:
-    """Return the velocity change per length between two centres that a contact causes in one step.
-
-    Args:
-        squared_distance: between the centres.
-        touching: distance at which both touch, in units of `CONTACT_MARGIN`.
-    """
+    """Return a contact's velocity change per length between the centres, which touch at `touching` CONTACT_MARGINs."""
     distance = squared_distance.clamp_min(_SMALLEST_SQUARED_DISTANCE).sqrt_()
     overlap = torch.add(touching, distance, alpha=-1 / CONTACT_MARGIN)
     # softplus by exp and log1p: PyTorch's own softplus differs in the last bit between its vector and scalar code.

@@ -18,18 +18,14 @@ from esp_envs.scene import Body, Scene
 from esp_envs.spec import TaskSpec
 
 PREDATOR_RADIUS, PREY_RADIUS, OBSTACLE_RADIUS = 0.075, 0.05, 0.2
-PREDATOR_GAIN, PREY_GAIN = 3.0, 4.0
-"""Acceleration of a full force, length / s^2."""
-PREDATOR_MAX_SPEED, PREY_MAX_SPEED = 1.0, 1.3
-"""length / s."""
+PREDATOR_GAIN, PREY_GAIN = 3.0, 4.0  # acceleration of a full force, length / s^2
+PREDATOR_MAX_SPEED, PREY_MAX_SPEED = 1.0, 1.3  # length / s
 OBSTACLE_EXTENT = 0.9
 TOUCH_REWARD = 10.0
 PREY_LEAD_S, OWN_LEAD_S = 0.25, 0.15
 """A predator aims from where it will be in OWN_LEAD_S at where the prey will be in PREY_LEAD_S; found by search."""
-URGENCY = 10.0
-"""Full force beyond 1 / URGENCY lengths of aiming error."""
-BOUND = 0.9
-"""The fleeing prey heads for the origin when farther from it than this (lengths)."""
+URGENCY = 10.0  # full force beyond 1 / URGENCY lengths of aiming error
+BOUND = 0.9  # the fleeing prey heads for the origin when farther from it than this (lengths)
 _FAR = 1e3
 _TINY = 1e-12
 
@@ -146,13 +142,11 @@ class PredatorPrey(ParticleTask):
         return torch.cat([*parts, prey - here, world["prey_velocity"].expand_as(here)], -1)
 
     def _prey_sees(self, world: World) -> Tensor:
-        """Return the prey's observation [..., D]."""
         prey = world["prey_position"]
         others = (world["position"] - prey).flatten(-2).unsqueeze(-2)
         return torch.cat([world["prey_velocity"], prey, self._obstacles_from(prey, world), others], -1).squeeze(-2)
 
     def _obstacles_from(self, place: Tensor, world: World) -> Tensor:
-        """Return the obstacles as they are seen from places [..., items, 2]: [..., items, 2 L]."""
         if "obstacles" not in world:
             return place[..., :0]
         return (world["obstacles"].unsqueeze(-3) - place.unsqueeze(-2)).flatten(-2)
@@ -163,7 +157,6 @@ class PredatorPrey(ParticleTask):
         return self._to_action(self._flight() if self._prey_learns else self._chase())
 
     def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
-        """Return obstacles, predators and prey of one world."""
         lane = world[0] * self.num_envs + world[1]
         places = self.worlds.entity[:, :, lane].tolist()
         predators = self.settings.num_predators
@@ -195,7 +188,6 @@ class PredatorPrey(ParticleTask):
         return drawn | {"prey_moves": plan.movedim(-1, 0)}
 
     def _drive(self) -> None:
-        """Set the controls of the bodies that do not learn."""
         predators = self.settings.num_predators
         if self._prey_learns:
             self._control[:predators] = self._as_control(self._chase())
@@ -248,24 +240,12 @@ def out_of_bounds(position: Tensor) -> Tensor:
 
 
 def chase(predator: Tensor, predator_velocity: Tensor, prey: Tensor, prey_velocity: Tensor) -> Tensor:
-    """Return the wishes [N, 2, W] of predators that run at the prey.
-
-    Args:
-        predator: [N, 2, W].
-        predator_velocity: [N, 2, W].
-        prey: [2, W].
-        prey_velocity: [2, W].
-    """
+    """Return the wishes [N, 2, W] of predators [N, 2, W] that run at the prey [2, W]."""
     return URGENCY * (prey + PREY_LEAD_S * prey_velocity - predator - OWN_LEAD_S * predator_velocity)
 
 
 def flee(predator: Tensor, prey: Tensor) -> Tensor:
-    """Return the wish [2, W] of a prey that runs from the nearest predator, and back when it is out of bounds.
-
-    Args:
-        predator: [N, 2, W].
-        prey: [2, W].
-    """
+    """Return the wish [2, W] of a prey: from the nearest of predators [N, 2, W], or back when out of bounds."""
     away = prey - predator
     squared = away.square().sum(1, keepdim=True)
     nearest = squared.argmin(0, keepdim=True).expand(1, 2, -1)

@@ -44,7 +44,6 @@ class PredatorPreySettings(ParticleSettings):
         return "c4" if self.control == "prey" else super().turns
 
     def without_effect(self) -> frozenset[str]:
-        """Return the names of settings that change nothing beside the others."""
         return frozenset({"prey_policy_seed"} if self.prey_policy is None else ())
 
     @model_validator(mode="after")

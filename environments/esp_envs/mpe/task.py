@@ -191,7 +191,6 @@ class ParticleTask(BatchedTask):
         return square[:, :, 0] + square[:, :, 1]
 
     def _act(self, action: Tensor) -> None:
-        """Write the learners' actions into the controls."""
         learners, worlds = self.spec.num_agents, self.worlds.num_worlds
         if self.settings.actions == "discrete":
             self._moves[:, 0, :worlds] = action.reshape(worlds, learners).t()
@@ -229,15 +228,11 @@ def _turned(force: Tensor, angle: float) -> Tensor:
     return torch.stack([cos * x - sin * y, sin * x + cos * y], 1)
 
 
-MOVE_THRESHOLD = 0.25
-"""A wish shorter than this along both axes becomes a no-op."""
+MOVE_THRESHOLD = 0.25  # a wish shorter than this along both axes becomes a no-op
 
 
 def nearest_move(wish: Tensor) -> Tensor:
-    """Return the discrete move [N, W] along the longer axis of a wish [N, 2, W].
-
-    The rule commutes with the eight symmetries of the square, except for wishes on a diagonal.
-    """
+    """Return the discrete move [N, W] along the longer axis of a wish [N, 2, W]."""
     x, y = wish[:, 0], wish[:, 1]
     sideways = x.abs() > y.abs()
     left, right, down, up = (MOVES.points.index(p) for p in (LEFT, RIGHT, DOWN, UP))

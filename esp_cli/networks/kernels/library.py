@@ -40,11 +40,7 @@ def computes(compiled: bool, x: Tensor) -> bool:
 
 @cache
 def library(name: str) -> ctypes.CDLL:
-    """Load a kernel, which takes up to a second to compile where nothing began it before.
-
-    Raises:
-        UserError: there is no C++ compiler, it fails, or what it made cannot be loaded.
-    """
+    """Load a kernel, which takes up to a second to compile where nothing began it before."""
     try:
         with begin(name).result() as folder:
             return ctypes.CDLL(str(Path(folder) / name))  # after torch, whose OpenMP it takes

@@ -1,4 +1,4 @@
-"""QMIX's mixer with its hypernetwork, compiled; see `networks.mixer`."""
+"""QMIX's mixer with its hypernetwork, compiled; see `networks.joint_q`."""
 
 from __future__ import annotations
 

@@ -163,7 +163,7 @@ def test_a_missing_library_is_named(name: str, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_the_engines_are_imported_when_they_are_asked_for() -> None:
-    code = "import sys, esp_envs.epuck.engines; print({'mujoco', 'pymunk'} & set(sys.modules))"
+    code = "import sys, esp_envs.epuck.physics; print({'mujoco', 'pymunk'} & set(sys.modules))"
     done = subprocess.run(
         [sys.executable, "-c", f"import sys; sys.path[:0] = {sys.path!r}; {code}"],
         capture_output=True,

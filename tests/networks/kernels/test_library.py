@@ -12,15 +12,15 @@ from typer.testing import CliRunner
 
 from esp_cli.app import app
 from esp_cli.networks import plain
+from esp_cli.networks.joint_q import MonotonicMixer
 from esp_cli.networks.kernels import library
 from esp_cli.networks.layers import SeedMLP
-from esp_cli.networks.mixer import MonotonicMixer
 from esp_cli.networks.plain import MlpConfig
 from esp_cli.networks.recurrent import SeedGRU
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
-from esp_cli.training.config_file import parse_config
+from esp_cli.training.settings import parse_config
 from tests.networks.kernels.compiler import needs_compiler
 from tests.networks.test_layers import generators
 

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
+from esp_cli.networks.joint_q import MonotonicMixer
 from esp_cli.networks.kernels.mixer import CompiledMixer
-from esp_cli.networks.mixer import MonotonicMixer
 from tests.networks.kernels.compiler import assert_same_bits_alone_and_for_any_threads, needs_compiler
 from tests.networks.test_layers import generators
 

@@ -1,1 +1,0 @@
-"""A grid world on a torus, seen in pictures."""
