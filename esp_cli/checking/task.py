@@ -95,10 +95,17 @@ def check_symmetry(
     return _reported(spec.name, method, spec, elements, verdicts, transforms)
 
 
-def check_recorded(source: str, spaces: Spaces, data: Transitions, transforms: str | None = None) -> SymmetryReport:
+def check_recorded(
+    source: str,
+    spaces: Spaces,
+    data: Transitions,
+    transforms: str | None = None,
+    watch: Watch = lambda *_: None,
+    seconds: float = math.inf,
+) -> SymmetryReport:
     """Judge transitions of a policy that prefers no direction, from whatever source; see `check_symmetry`."""
     elements = candidates(spaces, transforms)
-    verdicts = transitions.check_transitions(spaces, data, elements)
+    verdicts = transitions.check_transitions(spaces, data, elements, watch, time.monotonic() + seconds)
     return _reported(source, TRANSITIONS, spaces, elements, verdicts, transforms)
 
 

@@ -75,7 +75,9 @@ def _discovery(
         if logs:
             raise UserError(f"{what} is a file, of which nothing but transitions is known; leave --logs out")
         spec = make(task, 1, [0], resolve_task_settings(task, settings)).spec
-        return check_recorded(what, spec, read_transitions(path, spec), transforms)
+        data = read_transitions(path, spec)
+        with console.watching("check", "elements") as watch:
+            return check_recorded(what, spec, data, transforms, watch, seconds)
     name = what
     if task is not None and not path.is_dir():
         raise UserError(f"--task is for a run, or a file of transitions, and there is no {what}; leave it out")

@@ -127,7 +127,8 @@ def _line(row: dict[str, Any]) -> str:
     far = {name: unseen.pop(name) for name, found in list(unseen.items()) if _is_further_out(found)}
     for names, why in ((list(far), "only further out"), (list(unseen), "not covered")):
         told += [f"{why}: {', '.join(names[:4])}" + (" and more" if len(names) > 4 else "")] if names else []
-    return f"| {row['package']} {row['task']} | `{row['found']}` | {'; '.join(told[:3]) or '-'} | {row['method']} |"
+    group = row["found"].replace(" and ", "` and `")  # code does not wrap
+    return f"| {row['package']} {row['task']} | `{group}` | {'; '.join(told[:3]) or '-'} | {row['method']} |"
 
 
 def main() -> None:

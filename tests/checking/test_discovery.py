@@ -196,6 +196,8 @@ def test_a_file_of_transitions_is_judged_and_what_is_found_can_be_trained_with(t
     data = read_transitions(path, spec)
     flat = Transitions(*(part.flatten(0, 1).unsqueeze(1) for part in vars(data).values() if part is not None))
     assert check_recorded("rows", spec, flat, "rot90,flip-x").found == "flip-x"
+    late = check_recorded("rows", spec, flat, "rot90,flip-x", seconds=0).elements
+    assert {element.outcome for element in late} == {"not covered"}
 
 
 @pytest.mark.parametrize(
