@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from esp_cli.commands.demo import CURVES, FILM
-from esp_cli.console.progress import draw_curves
+from esp_cli.commands.demo import CURVES, FILM, draw_curves
 from tests.cli.running import TINY_OPTIONS, esp, refused
 
 DEMO = ("demo", "--steps", 100, "--seeds", 3, *TINY_OPTIONS)
