@@ -12,7 +12,7 @@ export PYTHONDONTWRITEBYTECODE :=
 PYTEST_ARGS ?= -n auto --maxprocesses 4 --dist worksteal --max-worker-restart 0
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow test-all check bench docs site torture clean
+.PHONY: help demo test test-slow check bench docs site torture clean
 
 help: ## list what make can do
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -20,14 +20,11 @@ help: ## list what make can do
 demo: $(VENV)/.installed ## train one learner with symmetry and without it: curves and a film of both (2 minutes)
 	$(BIN)/esp demo --out $(DEMO)
 
-test: $(VENV)/.installed-test ## run the tests (5 minutes), but for those marked slow
+test: $(VENV)/.installed-test ## run the tests (12 minutes), but for those marked slow
 	$(BIN)/python -m pytest -m "not slow" $(PYTEST_ARGS)
 
-test-slow: $(VENV)/.installed-test ## run the tests marked slow (3 minutes)
+test-slow: $(VENV)/.installed-test ## run the tests marked slow (6 minutes)
 	$(BIN)/python -m pytest -m slow $(PYTEST_ARGS)
-
-test-all: $(VENV)/.installed-test ## run both, in one go
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
 
 check: $(VENV)/.installed-dev ## lint, format and types over every package
 	$(BIN)/ruff check .
