@@ -14,6 +14,7 @@ from typing import ClassVar
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from esp_envs.errors import UserError
 from esp_envs.scene import Painter, Scene
@@ -81,6 +82,15 @@ def random_choice(allowed: Tensor, number: Tensor) -> Tensor:
     count = allowed.sum(-1)
     place = (number * count).long().minimum(count - 1)
     return (allowed.cumsum(-1) <= place.unsqueeze(-1)).sum(-1)
+
+
+def joined(parts: Sequence[Tensor]) -> Tensor:
+    """Return what the roles do or see as one tensor [S, E, N(, width)], zeros behind what is not as wide."""
+    if len(parts) == 1:
+        return parts[0]
+    width = max(part.shape[-1] for part in parts)
+    wide = (pad(part, (0, width - part.shape[-1])) if part.dim() > 3 else part for part in parts)
+    return torch.cat([*wide], 2)
 
 
 def require_shape(what: str, tensor: Tensor, expected: tuple[int, ...], dtype: torch.dtype | None = None) -> None:
@@ -260,7 +270,13 @@ class Environment(ABC):
         Allowed discrete actions are equally likely. Numbers of a continuous action are uniform in [-1, 1]. So a vector
         is uniform in a square, not in the disc: it prefers diagonals, and the task scales back what is longer than 1.
         """
-        shape, action, mask = self.action_shape[1:], self.spec.action, self.action_mask()
+        mask = self.action_mask()
+        return joined([self._drawn(role, role.own_mask(mask, where)) for role, where in self.spec.parts])
+
+    def _drawn(self, spec: TaskSpec, mask: Tensor | None) -> Tensor:
+        """Draw actions of all agents of a role [S, E, N] or [S, E, N, width]."""
+        action = spec.action
+        shape = (self.num_envs, spec.num_agents, *([action.width] if isinstance(action, Continuous) else []))
 
         def draw(generator: torch.Generator) -> Tensor:
             if mask is None and not isinstance(action, Continuous):

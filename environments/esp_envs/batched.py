@@ -183,7 +183,7 @@ class BatchedTask(Environment):
 
     def _play(self, action: Tensor) -> Outcome:
         """Advance every world; return reward [S, E, N] and metrics, as float32 memory of their own."""
-        outcome: object = self._advance(self.world, self.spec.action.admissible(action))
+        outcome: object = self._advance(self.world, self.spec.admissible(action))
         if not isinstance(outcome, tuple) or len(outcome) != 2 or not isinstance(outcome[0], Tensor):
             raise UserError(
                 f"'_advance' of {self.spec.name} gives {type(outcome).__name__}; return a tensor of rewards and a dict "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING
 
 from esp_envs.errors import UserError
@@ -135,6 +136,14 @@ class Spaces:
         return self.state == joint_layout(self.observation, self.num_agents)
 
     @property
+    def joint_fields(self) -> slice | None:
+        """Which fields of the state are all agents' observations end to end; None where there are none."""
+        own = joint_layout(self.observation, self.num_agents).fields
+        starts = range(len(self.state.fields) - len(own) + 1)
+        ends = (slice(k, k + len(own)) for k in starts if self.state.fields[k : k + len(own)] == own)
+        return next(ends, None)
+
+    @property
     def label(self) -> str:
         """What messages call these spaces."""
         return "the task"
@@ -155,6 +164,8 @@ class TaskSpec(Spaces):
         terminates: whether an episode can reach an end of its own before the horizon, each world at another time.
         agents_end: whether an agent can reach an end of its own before its episode, which goes on for the others.
         hidden: what decides what follows and is not in the global state, as "delayed actions".
+        roles: the agents by kind, where there is more than one, as `esp_envs.roles.spec_with_roles` makes them; each is
+            the task as one kind meets it. Rows and actions are then as wide as the widest, the rest is 0.
     """
 
     name: str
@@ -168,10 +179,37 @@ class TaskSpec(Spaces):
     agents_end: bool = False
     hidden: tuple[str, ...] = ()
     settings: dict[str, object] = field(default_factory=dict)
+    roles: tuple[TaskSpec, ...] = ()
 
     @property
     def label(self) -> str:
         return self.name
+
+    @property
+    def parts(self) -> tuple[tuple[TaskSpec, slice], ...]:
+        """Each role and where its agents are among all; the task itself and everyone where it has no roles."""
+        stops = list(accumulate(role.num_agents for role in self.roles))
+        each = zip(self.roles, pairwise([0, *stops]), strict=True)
+        return tuple((role, slice(*ends)) for role, ends in each) or ((self, slice(0, self.num_agents)),)
+
+    def own_mask(self, mask: Tensor | None, where: slice) -> Tensor | None:
+        """Return the part of a joint mask [S, E, N, A] that is of this role, whose agents are there; None without."""
+        if mask is None or not self.masks or not isinstance(self.action, Discrete):
+            return None
+        return mask[:, :, where, : self.action.count].contiguous()
+
+    def admissible(self, action: Tensor) -> Tensor:
+        """Return a joint action as the task takes it, see `Continuous`; a role's last action stands for larger ones."""
+        if not self.roles:
+            return self.action.admissible(action)
+        action = action.clone()
+        for role, where in self.parts:
+            if isinstance(role.action, Discrete):
+                action[:, :, where] = action[:, :, where].clamp_max(role.action.count - 1)
+            else:
+                numbers = slice(role.action.width)
+                action[:, :, where, numbers] = role.action.admissible(action[:, :, where, numbers])
+        return action
 
     def __post_init__(self) -> None:
         if self.num_agents < 1 or self.horizon < 1:

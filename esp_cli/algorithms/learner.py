@@ -124,6 +124,10 @@ class Learner(ABC):
     def steps_per_iteration(self) -> int:
         """Environment steps per seed of one iteration."""
 
+    def begin(self, progress: float) -> None:
+        """Set how strong the prior is in the next iteration."""
+        self.prior.begin(progress)
+
     @abstractmethod
     def iterate(self, progress: float) -> Iteration:
         """Collect, learn, and return what came out; `progress` is the share of the run that is done, 0 to 1."""

@@ -139,7 +139,7 @@ def judged(
 
 def _is_carried(element: Element, spaces: Spaces) -> bool:
     named = {field.name for field in spaces.state.fields}
-    return spaces.is_joint or all(name in named or name == AGENTS for name, _ in element.orders)
+    return spaces.joint_fields is not None or all(name in named or name == AGENTS for name, _ in element.orders)
 
 
 def _reported(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -52,6 +53,10 @@ class Policy(nn.Module):
     def initial_memory(self, num_envs: int, like: Tensor) -> Tensor:
         """Return the memory [S, E * N, H] with which an episode begins."""
         return self.actor.initial_memory(self.num_seeds, num_envs * self.num_agents, like)
+
+    def noise(self, num_envs: int, num_agents: int, generators: Sequence[torch.Generator], device: Any = "cpu") -> Any:
+        """Draw what `act` needs to draw actions, per seed from its own generator."""
+        return self.head.noise((num_envs, num_agents), generators).to(device)
 
     def step(self, obs: Tensor, memory: Tensor, action_mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return outputs, normalised, for obs [S, E, N, D] and allowed actions [S, E, N, A], and the memory."""

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from esp_cli.algorithms.learner import Learner, below
 from esp_cli.algorithms.presets import ALGORITHMS
+from esp_cli.algorithms.roles import new_policy
 from esp_cli.defaults import __version__
 from esp_cli.files.formatting import did_you_mean, shortened
 from esp_cli.networks.contract import NetworkConfig
@@ -225,7 +226,7 @@ def _repeated(weights: Mapping[str, Tensor], seeds: int) -> dict[str, Tensor]:
 
 
 def _untrained(config: RunConfig, spec: TaskSpec, network: NetworkConfig) -> Policy:
-    return ALGORITHMS[config.algorithm].build_policy(spec, network, generators(config.seeds, "shape")).eval()
+    return new_policy(ALGORITHMS[config.algorithm], spec, network, generators(config.seeds, "shape")).eval()
 
 
 def _at_default(network: NetworkConfig, *names: str) -> NetworkConfig:

@@ -15,10 +15,11 @@ from esp_cli.symmetry.representation import (
     joint_sources,
     layout_operator,
     require_items,
-    state_sources,
+    state_operator,
 )
 from esp_envs.errors import UserError
-from esp_envs.spec import Continuous, Discrete, Items, Spaces
+from esp_envs.roles import without_agents
+from esp_envs.spec import Continuous, Discrete, Items, Spaces, TaskSpec
 
 DISCOVERED = "discovered:"  # begins transforms that were found in data, and that the task need not declare
 _WITHOUT = "use --prior none, or let what holds be found: --prior auto, or --set prior.transforms=discovered"
@@ -92,6 +93,9 @@ def default_transforms(spaces: Spaces, weighed: bool = False) -> str:
         weighed: whether each element counts by how nearly it holds, so that nothing has to be declared: then d4
             wherever actions and layouts carry it, and such orders, or elements coupled with some, beside it.
     """
+    if isinstance(spaces, TaskSpec) and spaces.roles:
+        own = [default_transforms(role, weighed) for role in spaces.roles]
+        return next((name for name in own if _all_carry(name, spaces.roles, weighed)), own[0])
     declared = _factors(spaces)
     listed = [name for name in declared[:1] if name != "so2"]
     chosen = next((name for name in ("d4", *listed, "c4", *declared) if _carries(name, spaces)), "d4")
@@ -101,6 +105,11 @@ def default_transforms(spaces: Spaces, weighed: bool = False) -> str:
     if isinstance(found, Group) or len(found) > _FEW_ORDERS:
         return "d4"
     return f"d4,{chosen}" if all(element.orders for element in found) else "d4"
+
+
+def _all_carry(name: str, roles: Sequence[TaskSpec], weighed: bool) -> bool:
+    meant = [(name if role.num_agents > 1 else without_agents(name), role) for role in roles]
+    return all(not text or _carries(text, unrestricted(role) if weighed else role) for text, role in meant)
 
 
 def scene_of(symmetry: str, num_agents: int) -> str:
@@ -137,7 +146,7 @@ def exchangeable(spaces: Spaces) -> dict[str, int]:
         for field in spaces.observation.fields
         if field.items is Items.FIXED and field.pixels is None and 2 <= field.count <= MOST_ITEMS
         if not field.sorted_by
-        if field.name in own or spaces.is_joint
+        if field.name in own or spaces.joint_fields is not None
         if is_item_name(field.name)
     }
 
@@ -203,15 +212,14 @@ def _require_followed(elements: Sequence[Element], spaces: Spaces) -> None:
     """Refuse orders of agents or items that observation and state do not follow."""
     places = agent_places(elements, spaces.num_agents)
     if places is not None:
-        if not spaces.is_joint and all(f.items is not Items.AGENTS for f in spaces.state.fields):
+        if spaces.joint_fields is None and all(f.items is not Items.AGENTS for f in spaces.state.fields):
             raise UserError("its state does not say which numbers belong to which agent")
         joint_sources(spaces.observation, places[:1])
-        if not spaces.is_joint:
-            state_sources(spaces.state, places[:1])
+        state_operator(spaces, [Element(permutation=tuple(places[0].tolist()))])
     require_items(elements, spaces)
     seen, held = ({field.name for field in layout.fields} for layout in (spaces.observation, spaces.state))
     for name in dict.fromkeys(name for element in elements for name, _ in element.items):
-        if name in seen and name not in held and not spaces.is_joint:
+        if name in seen and name not in held and spaces.joint_fields is None:
             raise UserError(f"its state does not hold its {name}")
 
 

@@ -103,10 +103,19 @@ def rows_operator(layout: Layout, elements: Sequence[Element], num_agents: int) 
 def state_operator(spaces: Spaces, elements: Sequence[Element]) -> Operator:
     """Return L_g of the global state of Ds numbers."""
     places = agent_places(elements, spaces.num_agents)
-    if places is not None and spaces.is_joint:
-        return rows_operator(spaces.observation, elements, spaces.num_agents)
-    state = layout_operator(spaces.state, elements)
-    return state if places is None else state.ordered(state_sources(spaces.state, places))
+    rows = spaces.joint_fields
+    if places is None or rows is None:
+        return _numbers_operator(spaces.state, elements, places)
+    around = [Layout(spaces.state.fields[part]) for part in (slice(rows.start), slice(rows.stop, None))]
+    before, after = (_numbers_operator(part, elements, places) for part in around)
+    own = rows_operator(spaces.observation, elements, spaces.num_agents)
+    return Operator.beside([before, own, after], len(elements))
+
+
+def _numbers_operator(layout: Layout, elements: Sequence[Element], places: Indices | None) -> Operator:
+    """Return L_g of numbers of a state that are not the agents' rows; items of AGENTS follow them."""
+    part = layout_operator(layout, elements)
+    return part if places is None or not layout.fields else part.ordered(state_sources(layout, places))
 
 
 def output_operator(spaces: Spaces, elements: Sequence[Element]) -> Operator:
@@ -189,7 +198,8 @@ def _item_operator(field: Field, geometry: tuple[Geometry, ...]) -> Operator:
 
 def item_places(field: Field, elements: Sequence[Element]) -> Indices | None:
     """Return [G, count] the place that each item of a field moves to under each element, or None where all stay."""
-    name = re.sub(r"^agent\d+\.", "", field.name)  # a joint layout has one field for each agent: "agent0.landmarks"
+    # a joint layout has one field for each agent: "agent0.landmarks", of another role "prey.agent0.landmarks"
+    name = re.sub(r"^(\w+\.)?agent\d+\.", "", field.name)
     orders = [dict(element.items).get(name) for element in elements]
     moved = [order for order in orders if order is not None]
     if moved and (field.items is not Items.FIXED or field.pixels is not None):

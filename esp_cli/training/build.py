@@ -15,6 +15,7 @@ from torch import Tensor
 
 from esp_cli.algorithms.learner import Learner, LearnerConfig
 from esp_cli.algorithms.presets import ALGORITHMS
+from esp_cli.algorithms.roles import RolesLearner
 from esp_cli.networks.policy import Policy
 from esp_cli.prior.config import PriorConfig
 from esp_cli.prior.gate import fit_gate
@@ -24,6 +25,7 @@ from esp_envs.compass import Compass
 from esp_envs.conformance import QUICK, Subject, check
 from esp_envs.errors import UserError
 from esp_envs.registry import TASKS, make
+from esp_envs.roles import OthersAtRandom, RoleView
 from esp_envs.spec import TaskSpec
 
 
@@ -61,6 +63,8 @@ def build_environment(config: RunConfig, num_envs: int, *stream: object) -> Envi
 def with_compass(env: Environment, prior: PriorConfig) -> Environment:
     """Return worlds as the policies of a prior see them."""
     prior = prior.effective()
+    if env.spec.roles and prior.compass:
+        raise UserError(f"{env.spec.name} has roles, which no compass is made for; leave prior.compass out")
     return Compass(env, prior.compass, labels="agents" in prior.transforms) if prior.compass else env
 
 
@@ -90,13 +94,24 @@ def build_learner(config: RunConfig) -> Learner:
     settings = cls.config_class(**config.algorithm_settings)
     refuse_what_does_not_fit(config, settings, spec_of(config))
     env = build_environment(config, settings.num_envs, "training worlds")
+    if env.spec.roles:
+        return _learner_of_roles(cls, env, settings, config)
     own, of_prior = generators(config.seeds, "learner"), generators(config.seeds, "prior")
     learner = cls(env, settings, config.network, config.prior, own, of_prior)
     _set_gate(learner, config)
     return learner
 
 
-def _set_gate(learner: Learner, config: RunConfig) -> None:
+def _learner_of_roles(cls: type[Learner], env: Environment, settings: LearnerConfig, config: RunConfig) -> RolesLearner:
+    names = [role.name for role in env.spec.roles]
+    own, of_prior = ({name: generators(config.seeds, what, name) for name in names} for what in ("learner", "prior"))
+    learner = RolesLearner(cls, env, settings, config.network, config.prior, own, of_prior)
+    for name, part in learner.each.items():
+        _set_gate(part, config, name)
+    return learner
+
+
+def _set_gate(learner: Learner, config: RunConfig, role: str = "") -> None:
     """Give a learner the gate that its prior asks for, which is the same whatever seeds there are."""
     prior = config.prior.effective()
     if prior.trust != "gate" or learner.prior.transforms is None:
@@ -108,6 +123,7 @@ def _set_gate(learner: Learner, config: RunConfig) -> None:
     certain = {name for name, weight in prior.weights.items() if weight == 1}
     if certain != set(prior.weights):
         worlds = make(config.task, _GATE_WORLDS, stream_seeds((0,), "gate"), config.task_settings, config.device)
+        worlds = RoleView(OthersAtRandom(worlds), role) if role else worlds
         exchanged = any("agents" in name for name in prior.weights)
         gate = fit_gate(worlds, prior.doubt, certain, alike=not exchanged)
         learner.prior.gate = replace(gate, to_environment=learner.policy.head.to_environment)
@@ -176,8 +192,7 @@ class PolicyController:
         """Return the greedy or a drawn action, as `Environment.step` takes it."""
         noise = None
         if self.generators is not None:
-            shape = (env.num_envs, env.spec.num_agents)
-            noise = self.policy.head.noise(shape, self.generators).to(env.device)
+            noise = self.policy.noise(env.num_envs, env.spec.num_agents, self.generators, env.device)
         action, self.memory = self.policy.act(observation.obs, self.memory, noise, observation.action_mask)
         return action
 
@@ -208,7 +223,9 @@ class Episodes:
 
     returns: Tensor  # [S, E] mean over agents of the sum of rewards over time
     lengths: Tensor  # [S, E] steps
-    metrics: dict[str, Tensor]  # task measures, each [S, E]: means over the episode's steps or sums, as the spec says
+    # task measures, each [S, E]: means over the episode's steps or sums, as the spec says; and the return of each role
+    # as return_ROLE, where there are roles
+    metrics: dict[str, Tensor]
 
 
 @torch.no_grad()
@@ -220,15 +237,17 @@ def play(env: Environment, controller: Controller) -> Episodes:
     running = torch.ones(shape, dtype=torch.bool, device=env.device)
     returns, lengths = torch.zeros(shape, device=env.device), torch.zeros(shape, device=env.device)
     sums: dict[str, Tensor] = {}
+    by_role = {f"return_{role.name}": where for role, where in env.spec.parts} if env.spec.roles else {}
     for _ in range(env.spec.horizon):
         step = env.step(controller.act(env, observation))
         returns += torch.where(running, step.reward.mean(-1), 0.0)
         lengths += running
-        for name, value in step.metrics.items():
+        of_roles = {name: step.reward[..., where].mean(-1) for name, where in by_role.items()}
+        for name, value in (step.metrics | of_roles).items():
             sums[name] = sums.get(name, 0.0) + torch.where(running, value, 0.0)
         running &= ~step.ended
         observation = step.next
         if env.spec.terminates and not running.any():
             break
-    means = {name: value if name in env.spec.totals else value / lengths for name, value in sums.items()}
+    means = {name: value if name in {*env.spec.totals, *by_role} else value / lengths for name, value in sums.items()}
     return Episodes(returns, lengths, means)

@@ -150,7 +150,7 @@ class Trainer:
         begun = time.monotonic()
         before = self.step // self.config.evaluation.every_steps
         progress = self.iteration / self.total_iterations
-        self.learner.prior.begin(progress)
+        self.learner.begin(progress)
         result = self.learner.iterate(progress)
         self.iteration += 1
         row: dict[str, Any] = {name: value.cpu() for name, value in result.metrics.items()}

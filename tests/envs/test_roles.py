@@ -1,0 +1,215 @@
+"""Tasks with agents of several kinds: numbers worked out by hand, learners in step, runs, resuming, evaluation."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+from typer.testing import CliRunner
+
+from esp_cli.app import app
+from esp_cli.policies.evaluation import evaluate
+from esp_cli.policies.loading import open_policy
+from esp_cli.run import begin
+from esp_cli.symmetry import Element, build_transform, transform_set
+from esp_cli.training.build import ScriptedController, build_learner, play
+from esp_cli.training.config import RunConfig, resolve_config
+from esp_envs import Discrete, Field, Items, Kind, UserError, generators_for, joint_layout, layout, register
+from esp_envs.conformance import Subject, check
+from esp_envs.roles import Lockstep, OthersAtRandom, Role, RoleView, spec_with_roles
+from tests.envs.chase import STEPS, STEPS_OR_STAY, Chase
+
+TASK = register(Chase)
+CALL = CliRunner()
+
+
+def worlds(num_envs: int = 2, seeds: tuple[int, ...] = (3, 7)) -> Chase:
+    return Chase(Chase.Settings(), num_envs, generators_for(seeds))
+
+
+def placed(env: Chase) -> None:
+    """Hunters at 0 and 3, the prey at 1, in every world."""
+    env.reset()
+    env.set_state(torch.tensor([0.0, 3.0, 1.0]).expand(*env.state_shape).contiguous())
+
+
+def short(algorithm: str = "mappo", **overrides: object) -> RunConfig:
+    many = {f"{algorithm}.num_envs": 4, "evaluation.every_steps": 64, "evaluation.episodes": 4} | overrides
+    return resolve_config(TASK, algorithm, steps=128, seeds=(0, 1), overrides=many)
+
+
+def test_spaces_of_all_and_of_each_role():
+    spec = worlds().spec
+    assert (spec.num_agents, spec.observation.width, spec.action.count) == (3, 3, 3)
+    hunter, prey = spec.roles
+    assert (hunter.num_agents, hunter.action, hunter.shared_reward, hunter.symmetry) == (
+        2,
+        STEPS,
+        True,
+        "flip-x*agents",
+    )
+    assert (prey.num_agents, prey.action, prey.shared_reward, prey.symmetry) == (1, STEPS_OR_STAY, False, "flip-x")
+    assert [f.items for f in hunter.state.fields] == [Items.AGENTS, Items.FIXED]
+    assert [f.items for f in prey.state.fields] == [Items.FIXED, Items.FIXED]
+    assert [where for _, where in spec.parts] == [slice(0, 2), slice(2, 3)]
+
+
+def test_a_step_by_hand():
+    env = worlds()
+    placed(env)
+    # the first hunter goes up to 1, the second down to 2; the prey's 2 is up, to 2: gaps 1 and 0
+    step = env.step(torch.tensor([1, 0, 2]).expand(2, 2, 3))
+    assert step.next.obs[0, 0].tolist() == [[1, 2, 2], [2, 1, 2], [2, 1, 2]]
+    assert step.reward[0, 0].tolist() == [-0.5, -0.5, 1.0]
+    placed(env)
+    assert env.step(torch.full((2, 2, 3), 2)).next.state[0, 0].tolist() == [1, 4, 2]  # hunters have no action 2: up
+
+
+def test_each_role_meets_its_own_part():
+    env = worlds()
+    placed(env)
+    views = [RoleView(OthersAtRandom(env), name) for name in ("hunter", "prey")]
+    step = views[0].step(torch.ones(2, 2, 2, dtype=torch.int64))
+    assert step.next.obs.shape == (2, 2, 2, 3)
+    assert step.next.obs[..., 0].flatten().unique().tolist() == [1, 4]
+    assert step.reward.shape == (2, 2, 2)
+    assert views[1].reset().obs.shape == (2, 2, 1, 3)
+    with pytest.raises(UserError, match="no role 'fox'; it has hunter, prey"):
+        RoleView(OthersAtRandom(env), "fox")
+
+
+def test_learners_step_the_worlds_together():
+    env, order = worlds(), []
+    lockstep = Lockstep(env)
+
+    def job(name: str, action: Tensor):
+        def act() -> list[float]:
+            view = RoleView(lockstep, name)
+            view.reset()
+            order.append(name)
+            return [float(view.step(action).reward[0, 0, 0]) for _ in range(5)]
+
+        return act
+
+    jobs = [job("hunter", torch.ones(2, 2, 2).long()), job("prey", torch.full((2, 2, 1), 2))]
+    hunters, prey = lockstep.run(jobs)
+    assert [2 * -x for x in hunters] == prey
+    assert sorted(order) == ["hunter", "prey"]
+    alone = worlds()
+    alone.reset()
+    joint = torch.tensor([1, 1, 2]).expand(2, 2, 3)
+    assert [float(alone.step(joint).reward[0, 0, 2]) for _ in range(5)] == prey
+
+
+def test_the_first_error_ends_all_learners_and_they_go_on_afterwards():
+    lockstep = Lockstep(worlds())
+    views = [RoleView(lockstep, name) for name in ("hunter", "prey")]
+
+    def fail() -> None:
+        raise UserError("the prey broke")
+
+    with pytest.raises(UserError, match="the prey broke"):
+        lockstep.run([views[0].reset, fail])
+    with pytest.raises(UserError, match="hunter for a new episode, prey for the end"):
+        lockstep.run([views[0].reset, lambda: None])
+    assert len(lockstep.run([views[0].reset, views[1].reset])) == 2
+    assert threading.active_count() < 10
+
+
+def test_an_order_of_one_roles_agents_moves_what_others_see_of_them():
+    hunter = worlds().spec.roles[0]
+    swap = build_transform([Element(permutation=(1, 0))], hunter)
+    assert swap.state(torch.tensor([[0.0, 3.0, 1.0]])).tolist() == [[3, 0, 1]]
+    assert swap.obs(torch.tensor([[[0.0, 3.0, 1.0], [3.0, 0.0, 1.0]]])).tolist() == [[[3, 0, 1], [0, 3, 1]]]
+    rows = Field("hunters", Kind.SCALAR, 2, family="hunter")
+    of = {"action": Discrete(Kind.SCALAR, ((0.0,),), ("stay",)), "num_agents": 2}
+    spec = spec_with_roles(
+        [
+            Role(name="hunter", observation=layout(Field("place", Kind.SCALAR)), **of),
+            Role(name="prey", observation=layout(Field("own", Kind.SCALAR), rows), **of),
+        ],
+        name="rows", version=1, convention="none", horizon=1, symmetry="d4*agents",
+    )  # fmt: skip
+    # the state: two hunters, then of each prey its own number and the hunters
+    state = torch.tensor([[1.0, 2.0, 8.0, 1.0, 2.0, 9.0, 1.0, 2.0]])
+    orders = [build_transform([Element(permutation=(1, 0))], role).state(state).tolist() for role in spec.roles]
+    assert orders == [[[2, 1, 8, 2, 1, 9, 2, 1]], [[1, 2, 9, 1, 2, 8, 1, 2]]]
+    assert spec.roles[0].joint_fields == slice(0, 2)
+    assert spec.roles[1].state.fields[2:] == joint_layout(spec.roles[1].observation, 2).fields
+    assert transform_set("d4*agents", spec.roles[1]).size == 15
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [({"name": "prey"}, "two or more"), ({"name": "a b"}, "a word of its own"), ({"action": None}, "all discrete")],
+)
+def test_roles_that_do_not_go_together_are_refused(change, match):
+    from esp_envs import Continuous
+
+    wrong = {"action": Continuous(layout(Field("x", Kind.SCALAR)))} if "action" in change else change
+    row = layout(Field("place", Kind.SCALAR))
+    first = {"name": "hunter", "num_agents": 1, "observation": row, "action": STEPS} | wrong
+    with pytest.raises(UserError, match=match):
+        spec_with_roles(
+            [Role(**first), Role(name="prey", num_agents=1, observation=row, action=STEPS)],
+            name="x", version=1, convention="", horizon=1, symmetry="c1",
+        )  # fmt: skip
+
+
+def test_such_a_task_keeps_every_promise():
+    findings = check(Subject(lambda num_envs, seeds: worlds(num_envs, tuple(seeds))))
+    assert not [finding.broken for finding in findings if finding.broken]
+
+
+def test_returns_of_each_role_and_of_all():
+    episodes = play(worlds(), ScriptedController(lambda env: env.random_action()))
+    hunter, prey = (episodes.metrics[f"return_{name}"] for name in ("hunter", "prey"))
+    assert torch.allclose(prey, -2 * hunter)
+    assert torch.allclose(episodes.returns, (2 * hunter + prey) / 3, atol=1e-6)
+
+
+@pytest.mark.parametrize("algorithm", ["mappo", "maddpg", "qmix"])
+def test_every_algorithm_trains_both_roles_and_goes_on_bit_for_bit(algorithm):
+    def trained(iterations: int, state=None):
+        learner = build_learner(short(algorithm))
+        if state is not None:
+            learner.load_state_dict(state)
+        for k in range(iterations):
+            result = learner.iterate(k / 8)
+        return learner, result
+
+    whole, result = trained(4)
+    assert bool(result.finite.all())
+    assert {"train/hunter/return", "train/prey/return", "train/return"} <= result.metrics.keys()
+    assert whole.has_learned
+    half, _ = trained(2)
+    saved = {name: tensor.clone() for name, tensor in half.state_dict().items()}
+    assert {name.split(".")[1] for name in saved} == {"hunter", "prey"}
+    again = build_learner(short(algorithm))
+    again.load_state_dict(saved)
+    for k in (2, 3):
+        again.iterate(k / 8)
+    expected = whole.state_dict()
+    assert all(torch.equal(tensor, expected[name]) for name, tensor in again.state_dict().items())
+    policies = list(whole.policy.children())
+    assert not torch.equal(*(next(policy.parameters())[..., :1, :2].flatten()[:2] for policy in policies))
+
+
+def test_the_prior_acts_in_each_role():
+    learner = build_learner(short(**{"prior.transforms": "flip-x*agents"}))
+    sizes = {name: part.prior.transforms.size for name, part in learner.each.items()}
+    assert sizes == {"hunter": 2, "prey": 1}  # a mirror, and the mirror with an exchange
+    assert learner.each["hunter"].config.critic_input == "observations"
+    with pytest.raises(UserError, match="no compass"):
+        build_learner(short(**{"prior.compass": 1.0}))
+
+
+def test_a_run_is_trained_evaluated_and_loaded(tmp_path: Path):
+    begin(short(), None, tmp_path / "run").train()
+    found = evaluate(open_policy(tmp_path / "run"), 6)
+    assert {"return_hunter", "return_prey"} <= found.metrics.keys() & found.anchor_metrics["random"].keys()
+    told = CALL.invoke(app, ["eval", str(tmp_path / "run"), "--episodes", "4", "--json", "-"])
+    assert told.exit_code == 0, told.output
