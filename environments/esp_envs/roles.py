@@ -115,9 +115,15 @@ def _own_state(own: Role, roles: Sequence[Role], state: Layout | None) -> Layout
     return layout(*fields)
 
 
-def _follows(field: Field, own: Role) -> Field:
+def _follows(field: Field, own: Role | TaskSpec) -> Field:
     """Return a field whose items are the agents of a role, if they are."""
     return replace(field, family="", items=Items.AGENTS) if field.family == own.name else field
+
+
+def with_state(spec: TaskSpec, state: Layout) -> TaskSpec:
+    """Return the spec of a task with another global state, see `spec_with_roles`."""
+    own = ((role, layout(*(_follows(field, role) for field in state.fields))) for role in spec.roles)
+    return replace(spec, state=state, roles=tuple(replace(role, state=read) for role, read in own))
 
 
 class Turns(Protocol):

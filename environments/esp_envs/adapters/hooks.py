@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
 from typing import Any
 
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from esp_envs.adapters import foreign
 from esp_envs.adapters.pairing import Attributes, Simulator
 from esp_envs.errors import UserError
+from esp_envs.roles import of_role
 from esp_envs.spec import ActionSpace, Continuous, Discrete, Kind, Layout
 
 Array = NDArray[Any]
@@ -28,10 +29,12 @@ class CopyHooks(ABC):
     before the horizon, by an end of its own or by truncation, set `terminates`.
     """
 
-    observation: Layout
-    """What each learning agent sees, after `reading`."""
-    action: ActionSpace
-    """What each learning agent does; numbers in [-1, 1] are stretched to the bounds of a Box."""
+    observation: Layout | Mapping[str, Layout]
+    """What each learning agent sees, after `reading`; by role where agents of several kinds learn."""
+    action: ActionSpace | Mapping[str, ActionSpace]
+    """What each learning agent does, likewise; numbers in [-1, 1] are stretched to the bounds of a Box."""
+    roles: Mapping[str, Sequence[Any]] = {}
+    """The agents of each role; by default those whose names begin with the role's name in `observation`."""
     symmetry: str
     convention: str
     state: Layout | None = None
@@ -41,9 +44,10 @@ class CopyHooks(ABC):
     terminates: bool = False
     agents_end: bool = False
     """Whether agents may end one by one, by leaving `env.agents`, while the episode goes on for the others."""
-    masks: bool = False
-    """Whether the environment says which discrete actions are allowed; see `allowed`."""
-    shared_reward: bool = False
+    masks: bool | Mapping[str, bool] = False
+    """Whether the environment says which discrete actions are allowed; see `allowed`. May be given by role."""
+    shared_reward: bool | Mapping[str, bool] = False
+    """Whether all agents, or those of a role, get the same reward."""
     metrics: tuple[str, ...] = ()
     """Names of the numbers that `measure` returns; by default it takes them from the agents' infos."""
 
@@ -51,6 +55,30 @@ class CopyHooks(ABC):
     """What `take` returns, so that checks can pair states; known of MPE's particles, and where agents see all of it."""
     attributes: Attributes | None = None
     """Where the state stands in the environment, which is looked for when a check asks."""
+
+    @property
+    def role_names(self) -> tuple[str, ...]:
+        """The roles in order; none where all learning agents are alike."""
+        return tuple(self.roles or (self.observation if isinstance(self.observation, Mapping) else ()))
+
+    def role_of(self, agent: Any) -> str:
+        """Return the role of an agent; "" where it has none."""
+        if self.roles:
+            return next((role for role, agents in self.roles.items() if agent in agents), "")
+        return max((role for role in self.role_names if str(agent).startswith(role)), key=len, default="")
+
+    def layout_of(self, agent: Any) -> Layout:
+        """Return what a learning agent sees."""
+        given = self.observation
+        return given[self.role_of(agent)] if isinstance(given, Mapping) else given
+
+    def action_of(self, agent: Any) -> ActionSpace:
+        """Return what a learning agent does."""
+        return self.action[self.role_of(agent)] if isinstance(self.action, Mapping) else self.action
+
+    def masks_of(self, agent: Any) -> bool:
+        """Return whether a learning agent has masks."""
+        return of_role(self.masks, self.role_of(agent), False)
 
     @abstractmethod
     def make_one(self) -> Any:
@@ -78,7 +106,7 @@ class CopyHooks(ABC):
         """
         given = observation["observation"] if _has(observation, "action_mask") else observation
         if isinstance(given, Mapping):
-            names = [field.name for field in self.observation.fields]
+            names = [field.name for field in self.layout_of(agent).fields]
             if missing := next((name for name in names if name not in given), None):
                 raise UserError(
                     f"{agent} sees {', '.join(map(str, given))}, and the layout has '{missing}'; name fields as the "
@@ -127,14 +155,22 @@ class Copy:
         self.env = foreign.by_agent(task.make_one())
         foreign.require_kind(self.env, foreign.PARALLEL, "make_one")
         self.agents = list(self.env.possible_agents)
-        self.learners = [name for name in self.agents if str(name).startswith(task.learners)]
+        groups = {role: [name for name in self.agents if task.role_of(name) == role] for role in task.role_names}
+        if empty := next((role for role, names in groups.items() if not names), None):
+            listed = ", ".join(map(str, self.agents)) or "none"
+            raise UserError(
+                f"no agent's name begins with '{empty}'; the agents are {listed}; name those of a role in 'roles'"
+            )
+        everyone = [name for names in groups.values() for name in names] if groups else self.agents
+        self.learners = [name for name in everyone if str(name).startswith(task.learners)]
         if not self.learners:
             listed = ", ".join(map(str, self.agents)) or "none"
             raise UserError(f"no agent's name begins with '{task.learners}'; the agents are {listed}")
         if len(set(self.agents)) < len(self.agents):
             raise UserError("'possible_agents' names an agent twice; give each a name of its own")
         self.rest = [name for name in self.agents if name not in self.learners]
-        self.simulator = Simulator(self.env, self.learners, task.attributes)
+        self.simulator = Simulator(self.env, groups or {"": self.learners}, task.attributes)
+        self._width = max(task.layout_of(name).width for name in self.learners)
         spaces = [foreign.space_of(self.env, name) for name in self.learners]
         self._boxes = [_bounds(space) for space in spaces]
         starts = [getattr(space, "start", 0) for space in spaces]
@@ -155,14 +191,17 @@ class Copy:
     def see(self, name: Any, observation: Any) -> Array:
         """Return the numbers of the layout that a learning agent sees."""
         row = foreign.numbers(self._task.reading(name, observation), f"what {name} sees")
-        if (width := row.size) != self._task.observation.width:
-            raise UserError(f"{name} sees {width} numbers, but the layout has {self._task.observation.width}")
+        if (width := row.size) != (expected := self._task.layout_of(name).width):
+            raise UserError(f"{name} sees {width} numbers, but the layout has {expected}")
         return row
 
     def seen(self, given: Mapping[Any, Any]) -> Array:
-        """Return what learning agents see [N, D]; zeros of those that see nothing."""
-        rows = {name: self.see(name, given[name]) for name in self.learners if name in given}
-        return np.array([rows.get(name, np.zeros(self._task.observation.width)) for name in self.learners])
+        """Return what learning agents see [N, D]; zeros of those that see nothing, and behind shorter rows."""
+        rows = np.zeros((len(self.learners), self._width), np.float32)
+        for row, name in zip(rows, self.learners, strict=True):
+            if name in given:
+                row[: self._task.layout_of(name).width] = self.see(name, given[name])
+        return rows
 
     def require_spaces(self) -> None:
         """Refuse spaces that differ from the layouts, by looking at the first observation."""
@@ -173,20 +212,21 @@ class Copy:
         for name in self.learners:
             with self.naming("reading"):
                 self.see(name, first[name])
-            if task.masks and isinstance(task.action, Discrete):
+            action = task.action_of(name)
+            if task.masks_of(name) and isinstance(action, Discrete):
                 size = np.size(task.allowed(name, first[name], infos.get(name, {})))
-                if size != task.action.count:
-                    raise UserError(f"{name} has a mask of {size} actions, but the task has {task.action.count}")
+                if size != action.count:
+                    raise UserError(f"{name} has a mask of {size} actions, but the task has {action.count}")
             space = foreign.space_of(self.env, name)
             if type(task).acting is not CopyHooks.acting and _bounds(space) is None:
                 continue  # it makes of the layout's actions what the space holds
-            if isinstance(task.action, Discrete):
-                if getattr(space, "n", None) != task.action.count or space.shape != ():
-                    raise UserError(f"{name} acts in {space}, but the task says {task.action.count} discrete actions")
-            elif (box := _bounds(space)) is None or space.shape != (task.action.width,):
-                raise UserError(f"{name} acts in {space}, but the task says {task.action.width} bounded real numbers")
+            if isinstance(action, Discrete):
+                if getattr(space, "n", None) != action.count or space.shape != ():
+                    raise UserError(f"{name} acts in {space}, but the task says {action.count} discrete actions")
+            elif (box := _bounds(space)) is None or space.shape != (action.width,):
+                raise UserError(f"{name} acts in {space}, but the task says {action.width} bounded real numbers")
             else:
-                _require_round(task, name, box)
+                _require_round(action, task.symmetry, name, box)
         if task.state is not None and not callable(getattr(self.env, "state", None)):
             raise UserError("the task says what the state is, but its environment has no 'state' method")
         if task.state is not None and (got := self.state().size) != task.state.width:
@@ -199,13 +239,17 @@ class Copy:
             seen = {name: foreign.numbers(row, f"what {name} sees").size for name, row in rows}
         one = self.learners[0]
         for other in self.learners[1:]:
+            if self._task.role_of(one) != self._task.role_of(other):
+                one = other  # the first of the next role
+                continue
             spaces = [foreign.space_of(self.env, name) for name in (one, other)]
             does = [getattr(space, "n", None) or getattr(space, "shape", None) for space in spaces]
             if seen[one] != seen[other] or does[0] != does[1]:
                 raise UserError(
                     f"{one} sees {seen[one]} numbers and acts in {spaces[0]}, {other} sees {seen[other]} and acts in "
                     f"{spaces[1]}, but all that learn must be alike; begin 'learners' with the name of one kind, and "
-                    "let the others act by 'opponent', or give all the same numbers by 'reading'"
+                    "let the others act by 'opponent', or give 'observation' and 'action' by role, as "
+                    "{'adversary': ..., 'agent': ...}, so that both learn"
                 )
 
     def native(self, i: int, action: Array) -> Any:
@@ -240,19 +284,18 @@ class Copy:
             self.env.close()
 
 
-def _require_round(task: CopyHooks, name: Any, box: tuple[Array, Array]) -> None:
+def _require_round(action: Continuous, symmetry: str, name: Any, box: tuple[Array, Array]) -> None:
     """Refuse bounds that break the declared symmetry: a turn needs equal ones around 0, a mirror some around 0."""
-    assert isinstance(task.action, Continuous)
-    turns, mirrors = (re.match(pattern, task.symmetry) for pattern in (_TURNS, _MIRRORS))
+    turns, mirrors = (re.match(pattern, symmetry) for pattern in (_TURNS, _MIRRORS))
     low, high = box
-    for field, where in zip(task.action.layout.fields, task.action.layout.slices().values(), strict=True):
+    for field, where in zip(action.layout.fields, action.layout.slices().values(), strict=True):
         centred = np.allclose(low[where], -high[where])
         equal = centred and (np.ptp(high[where]) == 0 or (turns is not None and turns[0] in _HALF))
         bent = field.kind.is_vector and turns and not equal
         if bent or (field.kind is Kind.PSEUDOSCALAR and mirrors and not centred):
             raise UserError(
                 f"{name} acts by '{field.name}', a {field.kind.name}, between {low[where].tolist()} and "
-                f"{high[where].tolist()}, which '{task.symmetry}' does not leave alone; declare a smaller symmetry, or "
+                f"{high[where].tolist()}, which '{symmetry}' does not leave alone; declare a smaller symmetry, or "
                 "give bounds that are equal on all sides"
             )
 

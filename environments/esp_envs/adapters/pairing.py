@@ -52,8 +52,9 @@ class Attributes:
 class Simulator:
     """The simulator inside of an environment if it is of a known kind; else `attributes` say where its state stands."""
 
-    def __init__(self, env: Any, learners: Sequence[Any], attributes: Attributes | None = None) -> None:
-        self.bare, self._learners = getattr(env, "unwrapped", env), list(learners)
+    def __init__(self, env: Any, learners: Mapping[str, Sequence[Any]], attributes: Attributes | None = None) -> None:
+        """Take the learning agents by role; the role "" is of a task without roles."""
+        self.bare, self._learners = getattr(env, "unwrapped", env), learners
         self._attributes = attributes
 
     @property
@@ -62,7 +63,9 @@ class Simulator:
         fields = []
         for name, entities, what, items in self._columns():
             words = sum(np.size(entity.state.c) for entity in entities) if what == "c" else 0
-            fields.append(Field(name, Kind.SCALAR if words else Kind.VECTOR, words or len(entities), items=items))
+            role = name.rpartition(".")[0]
+            kind = Kind.SCALAR if words else Kind.VECTOR
+            fields.append(Field(name, kind, words or len(entities), items=items, family=role))
         return Layout(tuple(fields)) if fields else None
 
     def read(self) -> Array | None:
@@ -108,11 +111,15 @@ class Simulator:
         agents, landmarks = (list(getattr(world, name, None) or []) for name in ("agents", "landmarks"))
         if not agents or not all(hasattr(getattr(e, "state", None), "p_pos") for e in [*agents, *landmarks]):
             return []
-        own = [agent for name in self._learners for agent in agents if agent.name == name]
-        rest = [agent for agent in agents if agent not in own]
+        by_name = {agent.name: agent for agent in agents}
+        groups = {role: [by_name[n] for n in names if n in by_name] for role, names in self._learners.items()}
+        rest = [agent for agent in agents if not any(agent in own for own in groups.values())]
         columns = [
-            ("agents", own, "p_pos", Items.AGENTS),
-            ("velocities", own, "p_vel", Items.AGENTS),
+            (f"{role}.{name}".lstrip("."), own, what, Items.FIXED if role else Items.AGENTS)
+            for role, own in groups.items()
+            for name, what in (("agents", "p_pos"), ("velocities", "p_vel"))
+        ]
+        columns += [
             ("rest", rest, "p_pos", Items.FIXED),
             ("rest_velocities", rest, "p_vel", Items.FIXED),
             ("landmarks", landmarks, "p_pos", Items.FIXED),

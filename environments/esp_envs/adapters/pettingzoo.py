@@ -5,9 +5,8 @@ The adapter needs `possible_agents`, `reset(seed)`, `step(actions)` and the spac
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from typing import ClassVar
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -22,6 +21,7 @@ from esp_envs.adapters.stepper import CopyStepper
 from esp_envs.base import Environment, Observation, Step, require_shape
 from esp_envs.errors import UserError
 from esp_envs.installed import available_cores
+from esp_envs.roles import Role, of_role, spec_with_roles, with_state
 from esp_envs.scene import Scene
 from esp_envs.settings import TaskSettings
 from esp_envs.spec import ActionSpace, Discrete, Layout, TaskSpec, joint_layout
@@ -60,29 +60,9 @@ class ParallelTask(CopyHooks, Environment):
         super().__init__(settings, num_envs, generators)
         require_attributes(self, "observation", "action", "symmetry", "convention")
         for name, kind in (("observation", Layout), ("action", ActionSpace), ("state", Layout | None)):
-            if not isinstance(given := getattr(self, name), kind):
-                kinds = "a layout(...)" if name != "action" else "Discrete(...) or Continuous(...)"
-                raise UserError(
-                    f"the {name} of {type(self).__name__} is a {type(given).__name__}; give {kinds} of esp_envs"
-                )
+            self._require_kind(name, kind)
         one = Copy(self)
-        agents = len(one.learners)
-        self.spec = TaskSpec(
-            name=type(self).__name__.lower(),
-            version=1,
-            convention=self.convention,
-            num_agents=agents,
-            horizon=self.settings.horizon,
-            observation=self.observation,
-            state=self.state or joint_layout(self.observation, agents),
-            action=self.action,
-            symmetry=self.symmetry,
-            shared_reward=self.shared_reward,
-            terminates=self.terminates,
-            agents_end=self.agents_end,
-            masks=self.masks,
-            settings=settings.model_dump(),
-        )
+        self.spec = self._described(one)
         one.require_spaces()
         self._draws = getattr(one.simulator.bare, "render_mode", None) == "rgb_array"
         one.close()
@@ -91,6 +71,48 @@ class ParallelTask(CopyHooks, Environment):
         lead = (self.num_seeds, num_envs)
         self._base = torch.zeros(lead, dtype=torch.int64)
         self._begun, self._time = torch.zeros_like(self._base), torch.zeros_like(self._base)
+
+    def _require_kind(self, name: str, kind: Any) -> None:
+        """Refuse an attribute that is not of a kind, or not so for each role."""
+        given = getattr(self, name)
+        by_role = isinstance(given, Mapping) and name != "state"
+        if by_role and (missing := next((role for role in self.role_names if role not in given), None)):
+            raise UserError(f"the {name} of {type(self).__name__} is given by role, but not of '{missing}'; add it")
+        for one in given.values() if by_role else [given]:
+            if not isinstance(one, kind):
+                kinds = "a layout(...)" if name != "action" else "Discrete(...) or Continuous(...)"
+                raise UserError(
+                    f"the {name} of {type(self).__name__} is a {type(one).__name__}; give {kinds} of esp_envs"
+                )
+
+    def _described(self, one: Copy) -> TaskSpec:
+        """Return the spec, with roles where agents of several kinds learn."""
+        roles = [
+            Role(
+                name=role,
+                num_agents=len(agents),
+                observation=self.layout_of(agents[0]),
+                action=self.action_of(agents[0]),
+                shared_reward=of_role(self.shared_reward, role, False),
+                masks=self.masks_of(agents[0]),
+            )
+            for role in self.role_names or ("",)
+            if (agents := [name for name in one.learners if self.role_of(name) == role])
+        ]
+        named: dict[str, Any] = {
+            "name": type(self).__name__.lower(),
+            "version": 1,
+            "convention": self.convention,
+            "horizon": self.settings.horizon,
+            "symmetry": self.symmetry,
+            "terminates": self.terminates,
+            "agents_end": self.agents_end,
+            "settings": self.settings.model_dump(),
+        }
+        if self.role_names:
+            return spec_with_roles(roles, state=self.state, **named)
+        state = self.state or joint_layout(roles[0].observation, roles[0].num_agents)
+        return TaskSpec(**named | vars(roles[0]) | {"name": named["name"], "state": state})
 
     def reset(self) -> Observation:
         drawn = [torch.randint(2**62, (self.num_envs,), generator=g, device=self.device) for g in self.generators]
@@ -108,7 +130,7 @@ class ParallelTask(CopyHooks, Environment):
         require_shape("joint action", action, self.action_shape)
         copies = self._started()
         board = copies.board
-        board.action[:] = self.action.admissible(action).flatten(0, 1).cpu().numpy()
+        board.action[:] = self.spec.admissible(action).flatten(0, 1).cpu().numpy()
         board.cut[:] = (self._time + 1 == self.spec.horizon).flatten().numpy()
         copies.step()
         ended = torch.from_numpy(board.ended.copy()).view_as(self._base)
@@ -133,13 +155,13 @@ class ParallelTask(CopyHooks, Environment):
         """
         one = Copy(self)
         with one.naming("put"):
-            found = simulated_layout(one, self.observation, self.simulated)
-            if found is None and self.simulated is None:
-                self.attributes = deciding_attributes(one, self.observation, min(self.spec.horizon, 64))
+            found = simulated_layout(one, self.spec.observation, self.simulated)
+            if found is None and self.simulated is None and not self.spec.roles:
+                self.attributes = deciding_attributes(one, self.spec.observation, min(self.spec.horizon, 64))
                 found = None if self.attributes is None else self.attributes.layout
         one.close()
         if found is not None:
-            self._simulated, self._copies, self.spec = True, None, replace(self.spec, state=found)
+            self._simulated, self._copies, self.spec = True, None, with_state(self.spec, found)
         return self._simulated
 
     def has(self, method: str) -> bool:
@@ -170,15 +192,15 @@ class ParallelTask(CopyHooks, Environment):
     def _started(self) -> Stepper:
         if self._copies is None:
             count, workers = self._base.numel(), self._processes()
-            spec, discrete = self.spec, isinstance(self.action, Discrete)
+            spec, action = self.spec, self.spec.action
             sizes = Sizes(
                 count,
                 spec.num_agents,
                 spec.observation.width,
                 spec.state.width,
                 len(self.metrics),
-                None if discrete else self.action_shape[-1],
-                self.action.count if isinstance(self.action, Discrete) and self.masks else 0,
+                None if isinstance(action, Discrete) else action.width,
+                action.count if isinstance(action, Discrete) and spec.masks else 0,
             )
             if workers:
                 self._copies = WorkerCopies(sizes, self._stepper, workers)
@@ -202,12 +224,14 @@ class ParallelTask(CopyHooks, Environment):
         return list(map(seed_of, base.tolist(), episode.tolist()))
 
     def action_mask(self) -> Tensor | None:
-        return self._per_world(self._started().board.mask[NOW]).bool() if self.masks else None
+        return self._per_world(self._started().board.mask[NOW]).bool() if self.spec.masks else None
 
     def _seen(self, when: int = NOW) -> Observation:
         board = self._started().board
         obs, state, mask, alive = (self._per_world(x[when]) for x in (board.obs, board.state, board.mask, board.alive))
-        return Observation(obs, state, mask.bool() if self.masks else None, alive.bool() if self.agents_end else None)
+        return Observation(
+            obs, state, mask.bool() if self.spec.masks else None, alive.bool() if self.agents_end else None
+        )
 
     def _per_world(self, values: Array) -> Tensor:
         return torch.from_numpy(values.copy()).view(*self._base.shape, *values.shape[1:]).to(self.device)

@@ -12,6 +12,8 @@ from esp_envs.adapters import foreign
 from esp_envs.adapters.copies import FINAL, NOW, TERMINATED, TRUNCATED, Board
 from esp_envs.adapters.hooks import Copy, CopyHooks
 from esp_envs.errors import UserError
+from esp_envs.roles import of_role
+from esp_envs.spec import Discrete
 
 
 class CopyStepper:
@@ -90,10 +92,8 @@ class CopyStepper:
             of_task = f"of {type(task).__name__}"
             raise UserError(f"'step' gives {missing[0]} {of_task} no observation; give one to all that have not ended")
         paid = {name: self._paid(name, reward, name in ended and name not in seen) for name in acting}
-        shared = paid[acting[0]] if task.shared_reward else 0.0
-        if task.shared_reward and not np.allclose(list(paid.values()), shared, 1e-5, 1e-8, equal_nan=True):
-            raise UserError(f"agents of {type(task).__name__} get different rewards; leave out 'shared_reward'")
-        board.reward[k] = [paid.get(name, shared) for name in copy.learners]
+        shared = self._shared(paid)
+        board.reward[k] = [paid.get(name, shared.get(task.role_of(name), 0.0)) for name in copy.learners]
         over = [name for name in acting if name in ended or name in cut]
         if over and len(over) < len(acting) and not task.agents_end:
             raise UserError(
@@ -115,6 +115,17 @@ class CopyStepper:
         else:
             for seen_by in (board.obs, board.state, board.mask, board.alive):
                 seen_by[NOW, k] = seen_by[FINAL, k]
+
+    def _shared(self, paid: Mapping[Any, float]) -> dict[str, float]:
+        """Return the rewards that agents share, by role, after checking that they are the same."""
+        task, shared = self._task, dict[str, float]()
+        for name, reward in paid.items():
+            role = task.role_of(name)
+            if not of_role(task.shared_reward, role, False):
+                continue
+            if not np.allclose(reward, shared.setdefault(role, reward), 1e-5, 1e-8, equal_nan=True):
+                raise UserError(f"agents of {type(task).__name__} get different rewards; leave out 'shared_reward'")
+        return shared
 
     def _require_metrics(self, k: int) -> None:
         """Refuse a metric that no info has held when every copy has ended an episode."""
@@ -160,21 +171,24 @@ class CopyStepper:
         copy, seen, infos, task, board = self._copies[k], self._seen[k], self._infos[k], self._task, self.board
         alive = board.alive[when, k] = [name in self._living[k] for name in copy.learners]
         with copy.naming("reading", k):
-            for i, name in enumerate(copy.learners):
-                board.obs[when, k, i] = copy.see(name, seen[name]) if name in seen else 0
+            board.obs[when, k] = copy.seen(seen)
         if task.masks:
             over = when == FINAL and board.ended[k] > 0
             with copy.naming("allowed", k):
                 for i, name in enumerate(copy.learners):
                     row = np.ones(board.mask.shape[-1], np.float32)
-                    if alive[i]:
+                    action = task.action_of(name)
+                    if alive[i] and task.masks_of(name) and isinstance(action, Discrete):
                         allowed = task.allowed(name, seen[name], infos.get(name, {}))
-                        row = foreign.numbers(allowed, f"the mask of {name}", row.size)
+                        row[: action.count] = foreign.numbers(allowed, f"the mask of {name}", action.count)
+                        row[action.count :] = 0
                     if not row.any() and not over:
                         raise UserError(f"the mask of {name} allows nothing; leave it one action")
                     board.mask[when, k, i] = (row != 0) | (not row.any())  # after the end a mask often allows nothing
         if self._simulated:
             state = copy.take()
         else:
-            state = board.obs[when, k].reshape(-1) if task.state is None else copy.state(k)
+            rows = zip(board.obs[when, k], copy.learners, strict=True)
+            own = [row[: task.layout_of(name).width] for row, name in rows]
+            state = np.concatenate(own) if task.state is None else copy.state(k)
         board.state[when, k] = foreign.numbers(state, "the state", board.state.shape[-1])
