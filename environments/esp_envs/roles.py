@@ -15,6 +15,7 @@ from torch import Tensor
 
 from esp_envs.base import Environment, Observation, Step, generators_for, joined, require_shape
 from esp_envs.errors import UserError
+from esp_envs.promises import MakeWorlds
 from esp_envs.spec import ActionSpace, Continuous, Discrete, Field, Items, Kind, Layout, TaskSpec, joint_layout, layout
 
 T = TypeVar("T")
@@ -234,6 +235,11 @@ class OthersAtRandom:
         where = self.env.spec.parts[k][1]
         joint[:, :, where] = joined([action, joint[:, :, :0]])
         return self.env.step(joint)
+
+
+def worlds_of_role(make: MakeWorlds, role: str) -> MakeWorlds:
+    """Return what makes the worlds of one role, in which all others act at random."""
+    return lambda num_envs, seeds: RoleView(OthersAtRandom(make(num_envs, seeds)), role)
 
 
 class Lockstep:

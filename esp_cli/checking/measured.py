@@ -8,12 +8,15 @@ from functools import lru_cache
 
 from esp_cli.checking.task import TRANSITIONS, check_symmetry, judged
 from esp_cli.checking.verdicts import ElementVerdict
-from esp_cli.symmetry import Group, parse_elements
+from esp_cli.symmetry import Element, Group, parse_elements
 from esp_cli.symmetry.admission import DISCOVERED, admitted_elements, unrestricted
 from esp_cli.training.config import RunConfig
 from esp_envs.base import Environment
 from esp_envs.errors import UserError
+from esp_envs.promises import MakeWorlds
 from esp_envs.registry import make, task_class
+from esp_envs.roles import worlds_of_role
+from esp_envs.spec import TaskSpec
 
 _HORIZON = 50
 """Steps of an episode, at most, where a task has such a setting: of a longer one only the beginning is looked at."""
@@ -97,9 +100,26 @@ def _breaking(make_worlds: _Maker, transforms: str) -> tuple[tuple[str, float], 
     Raises:
         UserError: the task cannot carry the elements, or they cannot be listed.
     """
-    elements = admitted_elements(
-        transforms, unrestricted(make_worlds(1, [0]).spec)
-    )  # what is weighed need not be declared
+    spec = make_worlds(1, [0]).spec
+    if spec.roles:
+        return _breaking_of_roles(make_worlds, spec, transforms)
+    elements = admitted_elements(transforms, unrestricted(spec))  # what is weighed need not be declared
+    return _gaps_of(make_worlds, elements, transforms)
+
+
+def _breaking_of_roles(make_worlds: _Maker, spec: TaskSpec, transforms: str) -> tuple[tuple[str, float], ...]:
+    """Return the largest gap of each element among the roles, which share the prior's weights."""
+    gaps: dict[str, float] = {}
+    for role in spec.roles:
+        elements = admitted_elements(transforms, unrestricted(role))
+        for name, gap in _gaps_of(worlds_of_role(make_worlds, role.name), elements, transforms):
+            gaps[name] = max(gap, gaps.get(name, 0.0))
+    return tuple(gaps.items())
+
+
+def _gaps_of(
+    make_worlds: MakeWorlds, elements: tuple[Element, ...] | Group, transforms: str
+) -> tuple[tuple[str, float], ...]:
     if isinstance(elements, Group):
         raise UserError(
             f"a prior that is auto, measured or a gate weighs each element, but '{transforms}' is sampled; choose a "

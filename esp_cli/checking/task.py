@@ -16,6 +16,7 @@ from esp_cli.symmetry import Element
 from esp_cli.symmetry.admission import scene_of
 from esp_cli.symmetry.elements import AGENTS
 from esp_envs.base import Environment
+from esp_envs.errors import UserError
 from esp_envs.promises import MakeWorlds
 from esp_envs.spec import Spaces
 
@@ -90,6 +91,8 @@ def check_symmetry(
     """
     until = time.monotonic() + seconds
     spec = make(1, [0]).spec
+    if spec.roles:
+        raise UserError(f"{spec.name} has roles; 'esp check symmetry' judges each role by itself")
     elements = candidates(spec, transforms)
     method, verdicts = judged(make, elements, from_transitions, watch, until)
     return _reported(spec.name, method, spec, elements, verdicts, transforms)

@@ -62,11 +62,14 @@ def check(
         return make(task, num_envs, seeds, chosen)
 
     spec = make_worlds(1, [0]).spec  # a mistake in task or settings is the user's, not a broken promise
-    code = (
-        _check_task(task, spec, make_worlds, json)
-        if what == "task"
-        else _check_symmetry(make_worlds, transforms, policy, seconds, json)
-    )
+    if what == "task":
+        code = _check_task(task, spec, make_worlds, json)
+    elif spec.roles:
+        if policy is not None:
+            raise UserError(f"{task} has roles, of whose policies nothing is measured here; leave --policy out")
+        code = _check_roles(spec, make_worlds, transforms, seconds, json)
+    else:
+        code = _check_symmetry(make_worlds, transforms, policy, seconds, json)
     if code:
         raise typer.Exit(code)
 
@@ -74,7 +77,8 @@ def check(
 def _check_task(task: str, spec: TaskSpec, make_worlds: MakeWorlds, json: str | None) -> int:
     from esp_envs.conformance import Subject, check
 
-    findings = [_of_the_symmetry(spec), *check(Subject(make_worlds, rounding=_ROUNDING))]
+    symmetries = [_of_the_symmetry(role, bool(spec.roles)) for role, _ in spec.parts]
+    findings = [*symmetries, *check(Subject(make_worlds, rounding=_ROUNDING))]
     rows = [(f.promise, "broken" if f.broken else "-" if f.not_asked else "holds", f.broken or f.not_asked or "")
             for f in findings]  # fmt: skip
     title = f"What {task} promises as a task"
@@ -82,16 +86,41 @@ def _check_task(task: str, spec: TaskSpec, make_worlds: MakeWorlds, json: str | 
     return int(any(finding.broken for finding in findings))
 
 
-def _of_the_symmetry(spec: TaskSpec) -> Finding:
+def _of_the_symmetry(spec: TaskSpec, of_role: bool = False) -> Finding:
     """Return whether actions and layouts can carry what a task declares; `esp check symmetry` asks whether it holds."""
     from esp_cli.symmetry import admit_declared
     from esp_envs.conformance import Finding
 
+    said = f"{_SYMMETRY}: {spec.name}" if of_role else _SYMMETRY
     try:
         admit_declared(spec)
     except ValueError as error:
-        return Finding(_SYMMETRY, broken=str(error))
-    return Finding(_SYMMETRY, not_asked="none is declared" if spec.symmetry == "c1" and not spec.nearly else None)
+        return Finding(said, broken=str(error))
+    return Finding(said, not_asked="none is declared" if spec.symmetry == "c1" and not spec.nearly else None)
+
+
+def _check_roles(
+    spec: TaskSpec, make_worlds: MakeWorlds, transforms: str | None, seconds: float, json: str | None
+) -> int:
+    """Check the symmetry of each role, while all others act at random."""
+    from esp_cli.checking import check_symmetry
+    from esp_envs.roles import without_agents, worlds_of_role
+
+    reports = {}
+    for role in spec.roles:
+        asked = transforms if transforms is None or role.num_agents > 1 else without_agents(transforms)
+        if asked == "":
+            continue
+        with console.watching("check", "elements") as watch:
+            make = worlds_of_role(make_worlds, role.name)
+            reports[role.name] = check_symmetry(make, asked, watch=watch, seconds=seconds / len(spec.roles))
+
+    def show() -> None:
+        for report in reports.values():
+            _print(report, [])
+
+    console.result(json, {name: {"report": report, "holds": report.holds} for name, report in reports.items()}, show)
+    return 1 if any(r.broken for r in reports.values()) else 2 * any(r.uncovered for r in reports.values())
 
 
 def _check_symmetry(

@@ -61,6 +61,7 @@ def export(
     """Write a policy for other programs (ONNX, torch.export, C99, numpy) or robots, checked against the policy itself.
 
     Every export brings the layout and the units of its observation, the meaning of its actions, and a worked example.
+    Of a task whose agents have roles each role's policy gets a folder.
     """
     _check_options(formats, seed, episodes, name)
     from esp_cli.export.export import export as write
@@ -76,8 +77,20 @@ def export(
         console.result(json, entry, lambda: _announce(entry, out))
         return
     chosen = _best(trained, episodes or EPISODES) if seed is None else seed
-    exported = write(trained.single_seed(chosen), formats, out, force)
-    console.result(json, exported, lambda: _print(exported, f"{policy}, seed {chosen}", out))
+    if not trained.spec.roles:
+        exported = write(trained.single_seed(chosen), formats, out, force)
+        console.result(json, exported, lambda: _print(exported, f"{policy}, seed {chosen}", out))
+        return
+    each = {
+        role.name: write(trained.of_role(role.name).single_seed(chosen), formats, out / role.name, force)
+        for role in trained.spec.roles
+    }
+
+    def show() -> None:
+        for role, one in each.items():
+            _print(one, f"{policy}, {role}, seed {chosen}", out / role)
+
+    console.result(json, each, show)
 
 
 def _check_options(formats: list[str], seed: int | None, episodes: int | None, name: str | None) -> None:

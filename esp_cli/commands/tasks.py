@@ -47,10 +47,16 @@ def describe(name: str) -> dict[str, Any]:
         "agents": spec.num_agents,
         "horizon": spec.horizon,
         "observation": [
-            dict(zip(("index", "field", "kind", "unit"), r, strict=True)) for r in spec.observation.table()
+            {"index": where, "field": f"{role.name}.{name}" if spec.roles else name, "kind": kind, "unit": unit}
+            for role, _ in spec.parts
+            for where, name, kind, unit in role.observation.table()
         ],
-        "actions": [" ".join(pair) for pair in describe_action(spec.action)],
-        "symmetries": list(carried_groups(spec)),
+        "actions": [
+            (f"{role.name}: " if spec.roles else "") + " ".join(pair)
+            for role, _ in spec.parts
+            for pair in describe_action(role.action)
+        ],
+        "symmetries": list(dict.fromkeys(name for role, _ in spec.parts for name in carried_groups(role))),
         "heuristics": list(cls.heuristics),
         "settings": {
             key: {"default": field.default, "description": field.description or ""}

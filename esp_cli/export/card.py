@@ -66,9 +66,10 @@ def _action(spec: TaskSpec) -> dict[str, Any]:
 def title(trained: TrainedPolicy) -> str:
     """Return what the policy is in a line."""
     config = trained.config
+    role = f", role {trained.role}" if trained.role else ""
     prior = "without prior" if config.prior.kind == "none" else f"with the prior {config.prior.kind}"
     return (
-        f"{config.task} version {trained.spec.version}: greedy policy of {config.algorithm} {prior}, seed "
+        f"{config.task} version {trained.spec.version}{role}: greedy policy of {config.algorithm} {prior}, seed "
         f"{config.seeds[0]}, {trained.step} environment steps"
     )
 

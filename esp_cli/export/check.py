@@ -17,7 +17,6 @@ from esp_cli.export.program import Program
 from esp_cli.networks.heads import masked
 from esp_cli.networks.policy import Policy
 from esp_cli.policies.loading import TrainedPolicy
-from esp_cli.training.build import build_environment
 from esp_envs.errors import UserError
 
 OBSERVATIONS = 10_000  # observations on which every export is compared with its policy
@@ -85,7 +84,7 @@ def _whole(count: int, team: int) -> int:
 def _play(trained: TrainedPolicy, count: int) -> tuple[Tensor, Tensor, Tensor | None]:
     """Play a little and return the first observations, memories and action masks that the policy meets."""
     steps = min(_STEPS, trained.spec.horizon)
-    env = build_environment(trained.config, math.ceil(count / (steps * trained.spec.num_agents)), "export")
+    env = trained.worlds(math.ceil(count / (steps * trained.spec.num_agents)), "export")
     observation = env.reset()
     memory = trained.policy.initial_memory(env.num_envs, observation.obs)
     rows: list[tuple[Tensor, ...]] = []

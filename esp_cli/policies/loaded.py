@@ -163,6 +163,7 @@ def load_policy(
     task: str | type[Environment] | None = None,
     network: str | type[NetworkConfig] | None = None,
     settings: Mapping[str, object] | None = None,
+    role: str | None = None,
 ) -> LoadedPolicy:
     """Load a trained policy; loading runs no code but that of a task, algorithm or network which you name.
 
@@ -174,13 +175,14 @@ def load_policy(
         task: the task that the policy is of, as "module:Class" or as the class, where it is not installed.
         network: the settings class of its network, likewise.
         settings: of the task, where they are others than in training: {"num_agents": 100} for a network over sets.
+        role: whose policy, of a task whose agents have roles.
 
     Raises:
         UserError: nothing there, damaged, of another version, no such seed, or no such task.
     """
     register_own(task, algo, network)
     name = algo if isinstance(algo, str) else None
-    return LoadedPolicy(open_policy(Path(where), name, prior).transfer(settings or {}), seed)
+    return LoadedPolicy(open_policy(Path(where), name, prior).transfer(settings or {}).of_role(role), seed)
 
 
 def register_own(

@@ -22,15 +22,18 @@ from esp_cli.defaults import __version__
 from esp_cli.files.formatting import did_you_mean, shortened
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.policy import Policy
+from esp_cli.networks.roles import RolesPolicy
 from esp_cli.policies import bundled
-from esp_cli.training.build import generators, spec_of
+from esp_cli.training.build import build_environment, generators, spec_of
 from esp_cli.training.checkpoint import CheckpointError, read_initial, read_policy
 from esp_cli.training.config import InitialPolicy, RunConfig, resolve_task_settings
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.settings import parse_config
+from esp_envs.base import Environment
 from esp_envs.errors import UserError
 from esp_envs.mpe.frozen_prey import digest
 from esp_envs.registry import task_names
+from esp_envs.roles import OthersAtRandom, RoleView
 from esp_envs.spec import TaskSpec
 
 # modules beside the policy that a run may start from
@@ -48,6 +51,7 @@ class TrainedPolicy:
     source: Path  # the run folder or file
     notes: tuple[str, ...] = ()  # sentences for the user (a damaged checkpoint was passed over)
     stopped: tuple[int, ...] = ()  # places of seeds that stopped on a number that is not finite; theirs are early ones
+    role: str = ""  # whose policy it is, where it is that of one role alone
     further: Mapping[str, Tensor] = field(default_factory=dict)  # weights beside it: "critic...."
 
     @classmethod
@@ -101,6 +105,21 @@ class TrainedPolicy:
         policy = _untrained(config, spec, _at_default(config.network, "compiled")).to(config.device)
         policy.load_state_dict(self.policy.state_dict())
         return replace(self, config=config, spec=spec, policy=policy)
+
+    def of_role(self, role: str | None) -> TrainedPolicy:
+        """Return the policy of one role of its task; of a task without roles, which has none, the policy itself."""
+        names = [one.name for one in self.spec.roles]
+        if role not in names if names else role is not None:
+            has = f"has the roles {', '.join(names)}; name one of them" if names else "has no roles; leave role out"
+            raise UserError(f"{self.source} {has}")
+        if role is None or not isinstance(self.policy, RolesPolicy):
+            return self
+        return replace(self, spec=self.spec.roles[names.index(role)], policy=self.policy.of(role), role=role)
+
+    def worlds(self, num_envs: int, *stream: object) -> Environment:
+        """Make worlds as this policy meets them; agents of other roles act at random."""
+        env = build_environment(self.config, num_envs, *stream)
+        return RoleView(OthersAtRandom(env), self.role) if self.role else env
 
     def single_seed(self, seed: int | None = None) -> TrainedPolicy:
         """Return one seed's policy, by default the first's, on the CPU and with products in float32, for export."""

@@ -1,5 +1,7 @@
 """Four tasks of mpe2 whose agents are of several kinds that all learn."""
 
+# ruff: noqa: RUF012  (as users write a task)
+
 from __future__ import annotations
 
 from esp_envs import Discrete, Field, Items, Kind, layout

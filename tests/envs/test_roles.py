@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from pathlib import Path
 
@@ -10,7 +11,10 @@ import torch
 from torch import Tensor
 from typer.testing import CliRunner
 
+from esp_cli import load_policy
 from esp_cli.app import app
+from esp_cli.checking import check_symmetry
+from esp_cli.checking.measured import prepared
 from esp_cli.policies.evaluation import evaluate
 from esp_cli.policies.loading import open_policy
 from esp_cli.run import begin
@@ -19,7 +23,7 @@ from esp_cli.training.build import ScriptedController, build_learner, play
 from esp_cli.training.config import RunConfig, resolve_config
 from esp_envs import Discrete, Field, Items, Kind, UserError, generators_for, joint_layout, layout, register
 from esp_envs.conformance import Subject, check
-from esp_envs.roles import Lockstep, OthersAtRandom, Role, RoleView, spec_with_roles
+from esp_envs.roles import Lockstep, OthersAtRandom, Role, RoleView, spec_with_roles, worlds_of_role
 from tests.envs.chase import STEPS, STEPS_OR_STAY, Chase
 
 TASK = register(Chase)
@@ -213,3 +217,44 @@ def test_a_run_is_trained_evaluated_and_loaded(tmp_path: Path):
     assert {"return_hunter", "return_prey"} <= found.metrics.keys() & found.anchor_metrics["random"].keys()
     told = CALL.invoke(app, ["eval", str(tmp_path / "run"), "--episodes", "4", "--json", "-"])
     assert told.exit_code == 0, told.output
+
+
+def test_each_roles_policy_acts_and_is_exported_alone(tmp_path: Path):
+    begin(short(), None, tmp_path / "run").train()
+    prey = load_policy(tmp_path / "run", role="prey")
+    assert prey.spec.num_agents == 1
+    assert prey.act([[0.0, 1.0, 2.0]]).shape == (1,)
+    with pytest.raises(UserError, match="has the roles hunter, prey; name one"):
+        load_policy(tmp_path / "run")
+    with pytest.raises(UserError, match="has the roles"):
+        load_policy(tmp_path / "run", role="fox")
+    out = tmp_path / "out"
+    told = CALL.invoke(app, ["export", str(tmp_path / "run"), "--seed", "1", "-f", "numpy", "-o", str(out)])
+    assert told.exit_code == 0, told.output
+    for name, count in (("hunter", 2), ("prey", 3)):
+        described = json.loads((out / name / "policy.json").read_text())
+        assert len(described["action"]["options"]) == count
+        assert described["task"]["name"] == name
+
+
+def test_what_a_command_says_of_each_role(tmp_path: Path):
+    checked = CALL.invoke(app, ["check", "symmetry", TASK, "--json", str(tmp_path / "found.json")])
+    assert checked.exit_code == 0, checked.output
+    found = json.loads((tmp_path / "found.json").read_text())
+    assert [one["holds"] for one in found.values()] == [True, True]
+    report = check_symmetry(worlds_of_role(worlds, "hunter"))
+    assert report.found == "flip-x*agents"
+    assert {one.element for one in report.elements if one.declared} == {"flip-x", "agents-1-0"}
+    assert CALL.invoke(app, ["check", "task", TASK]).exit_code == 0
+    card = json.loads(CALL.invoke(app, ["tasks", TASK, "--json", "-"]).output)
+    assert [row["field"] for row in card["observation"]][3:] == ["prey.place", "prey.hunters"]
+    assert card["actions"][2:] == ["prey: 0 down (-1)", "prey: 1 stay (0)", "prey: 2 up (1)"]
+    assert card["symmetries"] == ["flip-x", "agents"]
+    refused = CALL.invoke(app, ["discover", TASK])
+    assert "judges each role by itself" in refused.output
+
+
+def test_a_prior_that_is_measured_weighs_each_element_by_its_worst_role():
+    config = prepared(short(**{"prior.kind": "auto", "prior.transforms": "flip-x"}))
+    assert config.prior.weights == {"flip-x": 1.0}
+    assert bool(build_learner(config).iterate(0.0).finite.all())
