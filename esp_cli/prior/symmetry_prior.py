@@ -11,8 +11,8 @@ from torch import Tensor
 from esp_cli.prior.copies import Copies
 from esp_cli.prior.gate import Gate, gated, moved_share
 from esp_cli.prior.seed_batch import Rows, SeedBatch
-from esp_cli.symmetry import Transform, carried_groups, transform_set
-from esp_cli.symmetry.admission import under_a_compass, unrestricted
+from esp_cli.symmetry import Transform, transform_set
+from esp_cli.symmetry.admission import carries, under_a_compass, unrestricted
 from esp_envs.errors import UserError
 from esp_envs.spec import Spaces
 
@@ -191,6 +191,7 @@ class SymmetryPrior:
 
 def _probe(spaces: Spaces, device: torch.device | str) -> list[Transform]:
     """Return a quarter turn and a mirror, as far as the task carries them, for measuring symmetry errors."""
-    carried = carried_groups(spaces)
-    elements = ",".join(name for name, group in (("rot90", "c4"), ("flip-x", "d4")) if group in carried)
-    return transform_set(elements, spaces, device).each() if elements else []
+    elements = [name for name in ("rot90", "flip-x") if carries(name, spaces)]
+    if elements == ["flip-x"]:  # both, or the turn alone
+        return []
+    return transform_set(",".join(elements), spaces, device).each() if elements else []

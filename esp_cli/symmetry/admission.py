@@ -79,7 +79,7 @@ def carried_groups(spaces: Spaces) -> tuple[str, ...]:
     agents = [AGENTS] if spaces.num_agents > 1 else []
     scene = scene_of(_usable(spaces), spaces.num_agents)
     names = dict.fromkeys([*PLANE_GROUPS, scene, *agents, *_factors(spaces)])
-    return tuple(name for name in names if name not in ("", "c1") and _carries(name, spaces))
+    return tuple(name for name in names if name not in ("", "c1") and carries(name, spaces))
 
 
 def default_transforms(spaces: Spaces, weighed: bool = False) -> str:
@@ -98,8 +98,8 @@ def default_transforms(spaces: Spaces, weighed: bool = False) -> str:
         return next((name for name in own if _all_carry(name, spaces.roles, weighed)), own[0])
     declared = _factors(spaces)
     listed = [name for name in declared[:1] if name != "so2"]
-    chosen = next((name for name in ("d4", *listed, "c4", *declared) if _carries(name, spaces)), "d4")
-    if not weighed or not _carries("d4", unrestricted(spaces)):
+    chosen = next((name for name in ("d4", *listed, "c4", *declared) if carries(name, spaces)), "d4")
+    if not weighed or not carries("d4", unrestricted(spaces)):
         return chosen
     found = parse_elements(chosen, spaces.num_agents)
     if isinstance(found, Group) or len(found) > _FEW_ORDERS:
@@ -175,7 +175,8 @@ def declares(symmetry: str, num_agents: int) -> Callable[[Element], bool]:
     return lambda element: element in group
 
 
-def _carries(name: str, spaces: Spaces) -> bool:
+def carries(name: str, spaces: Spaces) -> bool:
+    """Return whether a task's actions, layouts and declared symmetry carry elements or a group, by name."""
     found = parse_elements(name, spaces.num_agents)
     return _reason(_require, found.generators() if isinstance(found, Group) else found, spaces) is None
 

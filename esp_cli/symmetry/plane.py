@@ -192,11 +192,13 @@ class PlaneGroup(Group):
         return (radian, mirror()) if self.mirrors else (radian,)
 
 
+@lru_cache(maxsize=None)
 def cyclic(n: int) -> FiniteGroup:
     """Return C_n, the turns by multiples of 360/n degrees."""
     return FiniteGroup.generated_by(f"c{n}", [PlaneElement(Fraction(1, n))])
 
 
+@lru_cache(maxsize=None)
 def dihedral(n: int) -> FiniteGroup:
     """Return D_n, the 2n turns and mirrors of a regular n-gon with one corner on the x-axis."""
     return FiniteGroup.generated_by(f"d{n}", [PlaneElement(Fraction(1, n)), mirror()])

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -162,8 +163,9 @@ def field_operator(field: Field, elements: Sequence[Element]) -> Operator:
 
 def item_operator(field: Field, elements: Sequence[Element]) -> Operator:
     """Return how the numbers of one item of a field transform, with all things in their places."""
-    geometries = list(dict.fromkeys(element.geometry for element in elements))
-    index = [geometries.index(element.geometry) for element in elements]
+    geometries = dict.fromkeys(element.geometry for element in elements)
+    place = {geometry: i for i, geometry in enumerate(geometries)}
+    index = [place[element.geometry] for element in elements]
     if field.parts:
         parts = layout_operator(Layout(field.parts), [Element(geometry) for geometry in geometries]).selected(index)
         if field.pixels is None:
@@ -171,16 +173,16 @@ def item_operator(field: Field, elements: Sequence[Element]) -> Operator:
         pixels = item_operator(replace(field, parts=()), elements).source[..., 0]
         return parts.repeated(pixels.shape[1]).ordered(numbers_of(pixels, parts.width))
     each = [_item_operator(field, geometry) for geometry in geometries]
-    terms = max(one.terms for one in each)
-    source, weight = (
-        np.concatenate([np.pad(part, ((0, 0), (0, 0), (0, terms - part.shape[2]))) for part in parts])
-        for parts in zip(*((one.source, one.weight) for one in each), strict=True)
-    )
+    shape = (len(each), field.item_width, max(one.terms for one in each))
+    source, weight = np.zeros(shape, dtype=np.int64), np.zeros(shape)
+    for k, one in enumerate(each):
+        source[k, :, : one.terms], weight[k, :, : one.terms] = one.source[0], one.weight[0]
     return Operator(source, weight).selected(index)
 
 
+@lru_cache(maxsize=4096)  # building a learner asks for the same few again and again
 def _item_operator(field: Field, geometry: tuple[Geometry, ...]) -> Operator:
-    whole = Operator.reordering(np.arange(field.item_width)[None])
+    stays = whole = Operator.reordering(np.arange(field.item_width)[None])
     for one in geometry:
         part = Operator.of_block(one.block(field))
         if part.width != field.item_width:
@@ -188,6 +190,9 @@ def _item_operator(field: Field, geometry: tuple[Geometry, ...]) -> Operator:
                 f"{one.name} transforms {part.width} numbers of field '{field.name}', but an item of it has "
                 f"{field.item_width}"
             )
+        if whole is stays:
+            whole = part
+            continue
         probe = np.random.default_rng(0).normal(size=field.item_width)
         if not np.allclose(part.push(whole.push(probe)[0]), whole.push(part.push(probe)[0])):
             names = " and ".join(g.name for g in geometry)

@@ -30,6 +30,7 @@ from esp_cli.symmetry import (
     parse_elements,
     parse_group,
     plane,
+    representation,
     transform_set,
 )
 from esp_envs.errors import UserError
@@ -243,6 +244,7 @@ def test_a_wrong_order_of_agents_a_wrong_sign_and_a_limp_are_seen(legs, monkeypa
     assert limping["agents-1-0-2"] == "holds"
     right = legs.LegSwap.block
     monkeypatch.setattr(legs.LegSwap, "block", lambda g, field: right(g, field) * (-1 if g.swapped else 1))
+    monkeypatch.setattr(representation, "_item_operator", representation._item_operator.__wrapped__)
     assert verdicts(transitions())["swap-legs"] == "broken", "the sign is another"
 
 
