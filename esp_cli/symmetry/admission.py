@@ -109,7 +109,7 @@ def default_transforms(spaces: Spaces, weighed: bool = False) -> str:
 
 def _all_carry(name: str, roles: Sequence[TaskSpec], weighed: bool) -> bool:
     meant = [(name if role.num_agents > 1 else without_agents(name), role) for role in roles]
-    return all(not text or _carries(text, unrestricted(role) if weighed else role) for text, role in meant)
+    return all(not text or carries(text, unrestricted(role) if weighed else role) for text, role in meant)
 
 
 def scene_of(symmetry: str, num_agents: int) -> str:

@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 
 import numpy as np
 import torch
@@ -192,13 +192,13 @@ class PlaneGroup(Group):
         return (radian, mirror()) if self.mirrors else (radian,)
 
 
-@lru_cache(maxsize=None)
+@cache
 def cyclic(n: int) -> FiniteGroup:
     """Return C_n, the turns by multiples of 360/n degrees."""
     return FiniteGroup.generated_by(f"c{n}", [PlaneElement(Fraction(1, n))])
 
 
-@lru_cache(maxsize=None)
+@cache
 def dihedral(n: int) -> FiniteGroup:
     """Return D_n, the 2n turns and mirrors of a regular n-gon with one corner on the x-axis."""
     return FiniteGroup.generated_by(f"d{n}", [PlaneElement(Fraction(1, n)), mirror()])
