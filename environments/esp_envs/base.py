@@ -85,12 +85,18 @@ def random_choice(allowed: Tensor, number: Tensor) -> Tensor:
 
 
 def joined(parts: Sequence[Tensor]) -> Tensor:
-    """Return what the roles do or see as one tensor [S, E, N(, width)], zeros behind what is not as wide."""
+    """Return what the agents of all roles see or do as one tensor.
+
+    Args:
+        parts: of each role rows of numbers [..., agents, width], which get zeros behind them up to the widest, or
+            integers [..., agents], discrete actions.
+    """
     if len(parts) == 1:
         return parts[0]
+    if not parts[0].is_floating_point():
+        return torch.cat([*parts], -1)
     width = max(part.shape[-1] for part in parts)
-    wide = (pad(part, (0, width - part.shape[-1])) if part.dim() > 3 else part for part in parts)
-    return torch.cat([*wide], 2)
+    return torch.cat([pad(part, (0, width - part.shape[-1])) for part in parts], -2)
 
 
 def require_shape(what: str, tensor: Tensor, expected: tuple[int, ...], dtype: torch.dtype | None = None) -> None:

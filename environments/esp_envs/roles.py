@@ -50,12 +50,18 @@ def spec_with_roles(roles: Sequence[Role], *, symmetry: str, state: Layout | Non
             By default the state is all agents' observations, one after the other.
         **named: what else a `TaskSpec` has: name, version, convention, horizon, ...
 
+    One role alone makes a task without roles, whose rewards are shared if the role's are.
+
     Raises:
-        UserError: fewer than two roles, two of one name, a name that is no word, or actions of two sorts.
+        UserError: no role, two of one name, a name that is no word, or actions of two sorts.
     """
     names = [role.name for role in roles]
-    if len(set(names)) < max(len(names), 2) or not all(name.isidentifier() for name in names):
-        raise UserError(f"roles are named {', '.join(names) or 'not at all'}; give two or more, each a word of its own")
+    if len(roles) == 1:
+        own = roles[0]
+        state = joint_layout(own.observation, own.num_agents) if state is None else state
+        return TaskSpec(**vars(own) | named, state=state, symmetry=symmetry)
+    if not roles or len(set(names)) < len(names) or not all(name.isidentifier() for name in names):
+        raise UserError(f"roles are named {', '.join(names) or 'not at all'}; give each a word of its own")
     actions = [role.action for role in roles]
     if len({type(action) for action in actions}) > 1:
         raise UserError(f"{' and '.join(names)} act by different sorts of actions; make all discrete or all continuous")
@@ -118,7 +124,7 @@ def _own_state(own: Role, roles: Sequence[Role], state: Layout | None) -> Layout
 
 def _follows(field: Field, own: Role | TaskSpec) -> Field:
     """Return a field whose items are the agents of a role, if they are."""
-    return replace(field, family="", items=Items.AGENTS) if field.family == own.name else field
+    return replace(field, items=Items.AGENTS) if field.family == own.name else field
 
 
 def with_state(spec: TaskSpec, state: Layout) -> TaskSpec:

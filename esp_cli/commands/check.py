@@ -113,7 +113,7 @@ def _check_roles(
             continue
         with console.watching("check", "elements") as watch:
             make = worlds_of_role(make_worlds, role.name)
-            reports[role.name] = check_symmetry(make, asked, watch=watch, seconds=seconds / len(spec.roles))
+            reports[role.name] = check_symmetry(make, asked, watch=watch, seconds=seconds)
 
     def show() -> None:
         for report in reports.values():

@@ -21,13 +21,18 @@ from esp_cli.run import begin
 from esp_cli.symmetry import Element, build_transform, transform_set
 from esp_cli.training.build import ScriptedController, build_learner, play
 from esp_cli.training.config import RunConfig, resolve_config
-from esp_envs import Discrete, Field, Items, Kind, UserError, generators_for, joint_layout, layout, register
+from esp_envs import Discrete, Field, Items, Kind, UserError, generators_for, joint_layout, layout, make, register
 from esp_envs.conformance import Subject, check
 from esp_envs.roles import Lockstep, OthersAtRandom, Role, RoleView, spec_with_roles, worlds_of_role
 from tests.envs.chase import STEPS, STEPS_OR_STAY, Chase
 
-TASK = register(Chase)
+TASK = "tests.envs.chase:Chase"
 CALL = CliRunner()
+
+
+@pytest.fixture(autouse=True)
+def _registered():
+    register(Chase)
 
 
 def worlds(num_envs: int = 2, seeds: tuple[int, ...] = (3, 7)) -> Chase:
@@ -148,7 +153,11 @@ def test_an_order_of_one_roles_agents_moves_what_others_see_of_them():
 
 @pytest.mark.parametrize(
     ("change", "match"),
-    [({"name": "prey"}, "two or more"), ({"name": "a b"}, "a word of its own"), ({"action": None}, "all discrete")],
+    [
+        ({"name": "prey"}, "prey, prey; give each"),
+        ({"name": "a b"}, "a word of its own"),
+        ({"action": None}, "all discrete"),
+    ],
 )
 def test_roles_that_do_not_go_together_are_refused(change, match):
     from esp_envs import Continuous
@@ -257,4 +266,24 @@ def test_what_a_command_says_of_each_role(tmp_path: Path):
 def test_a_prior_that_is_measured_weighs_each_element_by_its_worst_role():
     config = prepared(short(**{"prior.kind": "auto", "prior.transforms": "flip-x"}))
     assert config.prior.weights == {"flip-x": 1.0}
+    assert bool(build_learner(config).iterate(0.0).finite.all())
+
+
+def test_both_sides_of_predator_prey_see_and_get_what_each_does_alone():
+    both, hunters, hunted = (make("predator-prey", 3, [5], {"control": who}) for who in ("both", "predators", "prey"))
+    for env in (both, hunters, hunted):
+        env.reset()
+    state = both.reset().state
+    seen, (_, prey) = both.set_state(state), both.spec.parts
+    assert torch.equal(seen.obs[:, :, :3], hunters.set_state(state).obs)
+    assert torch.equal(seen.obs[:, :, 3:, : prey[0].observation.width], hunted.set_state(state).obs)
+    action = both.heuristic()
+    step, chased = both.step(action), hunted.step(action[:, :, 3:])
+    assert torch.equal(step.next.state, chased.next.state)
+    assert torch.equal(step.reward[:, :, 3:], chased.reward)
+    assert [role.name for role in both.spec.roles] == ["predators", "prey"]
+    assert both.spec.roles[0].state == hunters.spec.state
+    with pytest.raises(ValueError, match="with control 'both' the prey is a learner"):
+        make("predator-prey", 1, [0], {"control": "both", "prey": "still"})
+    config = resolve_config("predator-prey", steps=100, overrides={"task.control": "both", "mappo.num_envs": 4})
     assert bool(build_learner(config).iterate(0.0).finite.all())

@@ -24,7 +24,7 @@ from esp_envs.installed import available_cores
 from esp_envs.roles import Role, of_role, spec_with_roles, with_state
 from esp_envs.scene import Scene
 from esp_envs.settings import TaskSettings
-from esp_envs.spec import ActionSpace, Discrete, Layout, TaskSpec, joint_layout
+from esp_envs.spec import ActionSpace, Discrete, Layout, TaskSpec
 
 _FEW_COPIES = 8  # up to this number of copies, worker processes cost more time than they save
 
@@ -99,20 +99,18 @@ class ParallelTask(CopyHooks, Environment):
             for role in self.role_names or ("",)
             if (agents := [name for name in one.learners if self.role_of(name) == role])
         ]
-        named: dict[str, Any] = {
-            "name": type(self).__name__.lower(),
-            "version": 1,
-            "convention": self.convention,
-            "horizon": self.settings.horizon,
-            "symmetry": self.symmetry,
-            "terminates": self.terminates,
-            "agents_end": self.agents_end,
-            "settings": self.settings.model_dump(),
-        }
-        if self.role_names:
-            return spec_with_roles(roles, state=self.state, **named)
-        state = self.state or joint_layout(roles[0].observation, roles[0].num_agents)
-        return TaskSpec(**named | vars(roles[0]) | {"name": named["name"], "state": state})
+        return spec_with_roles(
+            roles,
+            name=type(self).__name__.lower(),
+            version=1,
+            convention=self.convention,
+            horizon=self.settings.horizon,
+            symmetry=self.symmetry,
+            state=self.state,
+            terminates=self.terminates,
+            agents_end=self.agents_end,
+            settings=self.settings.model_dump(),
+        )
 
     def reset(self) -> Observation:
         drawn = [torch.randint(2**62, (self.num_envs,), generator=g, device=self.device) for g in self.generators]

@@ -9,6 +9,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from esp_envs.base import joined
 from esp_envs.batched import World, to_others
 from esp_envs.mpe.frozen_prey import FrozenPrey
 from esp_envs.mpe.particles import Bodies
@@ -36,6 +37,8 @@ class PredatorPrey(ParticleTask):
     Predators (radius 0.075, acceleration 3 length/s^2, at most 1.0 length/s) hunt one prey (0.05, 4, 1.3) among
     obstacles (0.2). All bodies push each other apart. The plane is unbounded; lengths have no physical unit, a step is
     0.1 s.
+
+    With `control="both"` predators and prey learn, as roles of these names: each sees and gets what it does alone.
 
     Actions, of each predator (of the prey with `control="prey"`):
         discrete: 0 no-op, 1 left, 2 right, 3 down, 4 up: full acceleration in that direction.
@@ -97,8 +100,8 @@ class PredatorPrey(ParticleTask):
     settings: PredatorPreySettings
 
     def __init__(self, settings: PredatorPreySettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
-        self._prey_learns = settings.control == "prey"
-        self.first_learner = settings.num_predators if self._prey_learns else 0
+        self._prey_learns = settings.control != "predators"
+        self.first_learner = settings.num_predators if settings.control == "prey" else 0
         super().__init__(settings, num_envs, generators)
         lanes, horizon = self.worlds.num_lanes, settings.horizon
         self._prey_plan = torch.zeros(horizon, 2, lanes, device=self.device)
@@ -135,11 +138,13 @@ class PredatorPrey(ParticleTask):
         return self.world["prey_moves"].permute(2, 0, 1, 3)
 
     def _observe(self, world: World) -> Tensor:
-        if self._prey_learns:
-            return self._prey_sees(world).unsqueeze(-2)
+        prey_sees = self._prey_sees(world).unsqueeze(-2)
+        if self.settings.control == "prey":
+            return prey_sees
         here, prey, velocity = world["position"], world["prey_position"], world["velocity"]
         parts = [velocity, here, self._obstacles_from(here, world), to_others(here).flatten(-2)]
-        return torch.cat([*parts, prey - here, world["prey_velocity"].expand_as(here)], -1)
+        rows = torch.cat([*parts, prey - here, world["prey_velocity"].expand_as(here)], -1)
+        return joined([rows, prey_sees]) if self._prey_learns else rows
 
     def _prey_sees(self, world: World) -> Tensor:
         prey = world["prey_position"]
@@ -152,9 +157,11 @@ class PredatorPrey(ParticleTask):
         return (world["obstacles"].unsqueeze(-3) - place.unsqueeze(-2)).flatten(-2)
 
     def heuristic(self, name: str | None = None) -> Tensor:
-        """Return the joint action of `greedy`: the chase, or the flight with `control="prey"`."""
+        """Return the joint action of `greedy`: the chase of predators that learn, the flight of such a prey."""
         self.named_heuristic(name)
-        return self._to_action(self._flight() if self._prey_learns else self._chase())
+        sides = {"predators": self._chase, "prey": self._flight}
+        learning = [wish() for side, wish in sides.items() if self.settings.control in (side, "both")]
+        return self._to_action(torch.cat(learning))
 
     def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
         lane = world[0] * self.num_envs + world[1]
@@ -189,9 +196,11 @@ class PredatorPrey(ParticleTask):
 
     def _drive(self) -> None:
         predators = self.settings.num_predators
-        if self._prey_learns:
+        if self.settings.control == "prey":
             self._control[:predators] = self._as_control(self._chase())
-        elif self.settings.prey == "random":
+        if self._prey_learns:
+            return
+        if self.settings.prey == "random":
             self._control[predators] = self._prey_plan[self._time]
         elif self.settings.prey == "fleeing":
             self._control[predators:] = self._as_control(self._flight())
@@ -224,7 +233,9 @@ class PredatorPrey(ParticleTask):
         metrics = {"contact": touches.clamp_max(1.0), "touches": touches}
         reward = paid * TOUCH_REWARD
         if self._prey_learns:
-            reward = -reward - out_of_bounds(self.worlds.position[predators]).sum(0)
+            hunted = -reward - out_of_bounds(self.worlds.position[predators]).sum(0)
+            both = torch.cat([reward.expand(predators, -1), hunted.unsqueeze(0)])
+            reward = hunted if self.settings.control == "prey" else both
         return reward, metrics
 
 

@@ -10,6 +10,7 @@ from pydantic import field_validator, model_validator
 
 from esp_envs.errors import UserError
 from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings
+from esp_envs.roles import Role, spec_with_roles
 from esp_envs.settings import Breaks
 from esp_envs.spec import Field, Items, Kind, Layout, TaskSpec, filled_layout
 
@@ -19,8 +20,9 @@ class PredatorPreySettings(ParticleSettings):
 
     num_predators: int = Setting(3, ge=1, le=64, description="predators; 3 in the paper")
     num_obstacles: int = Setting(2, ge=0, le=8, description="fixed discs; 2 in MPE, 3 by the authors' launcher")
-    control: Literal["predators", "prey"] = Setting(
-        "predators", description="who learns; with 'prey' the predators follow the greedy heuristic"
+    control: Literal["predators", "prey", "both"] = Setting(
+        "predators",
+        description="who learns; with 'prey' the predators follow the greedy heuristic, with 'both' each side learns",
     )
     prey: Literal["random", "fleeing", "still", "policy"] = Setting(
         "random", description="who drives the prey while the predators learn"
@@ -41,15 +43,15 @@ class PredatorPreySettings(ParticleSettings):
     @property
     def turns(self) -> str:
         """The rotations that actions, dynamics and reward carry; the learning prey's bounds are a square."""
-        return "c4" if self.control == "prey" else super().turns
+        return super().turns if self.control == "predators" else "c4"
 
     def without_effect(self) -> frozenset[str]:
         return frozenset({"prey_policy_seed"} if self.prey_policy is None else ())
 
     @model_validator(mode="after")
     def _policy_goes_with_its_file(self) -> PredatorPreySettings:
-        if self.control == "prey" and (self.prey != "random" or self.learned_prey):
-            raise UserError("with control 'prey' the prey is the learner; leave prey and learned_prey out")
+        if self.control != "predators" and (self.prey != "random" or self.learned_prey):
+            raise UserError(f"with control '{self.control}' the prey is a learner; leave prey and learned_prey out")
         if self.prey == "policy" and self.learned_prey:
             raise UserError("prey 'policy' follows its file at every step; leave learned_prey out")
         if (self.prey == "policy" or self.learned_prey > 0) != (self.prey_policy is not None):
@@ -61,24 +63,29 @@ class PredatorPreySettings(ParticleSettings):
 
 def predator_prey_spec(settings: PredatorPreySettings) -> TaskSpec:
     """Return the spec that follows from the settings."""
-    prey_learns, discrete = settings.control == "prey", settings.actions == "discrete"
+    control, prey_learns, discrete = settings.control, settings.control != "predators", settings.actions == "discrete"
     order = "velocity first" if settings.convention == "esp" else "position first"
-    reward = "-10 a touch, bounds" if prey_learns else "10 a touch to each predator"
-    opponent = "greedy predators" if prey_learns else f"{settings.prey} prey"
+    rewards = {"predators": "10 a touch to each predator", "prey": "-10 a touch, bounds"}
+    reward = rewards.get(control, ", ".join(f"{who} {what}" for who, what in rewards.items()))
+    opponent = {"prey": "greedy predators", "both": "both learn"}.get(control, f"{settings.prey} prey")
     whole = "d4*agents" if discrete or prey_learns else "o2*agents"
     learned = [Breaks("c1", agents=False)] if settings.prey == "policy" else []
-    return TaskSpec(
+    sides = {"predators": (settings.num_predators, _predator_layout(settings)), "prey": (1, prey_layout(settings))}
+    action = MOVES if discrete else FORCE
+    roles = [
+        Role(name=name, num_agents=count, observation=seen, action=action, shared_reward=True)
+        for name, (count, seen) in sides.items()
+        if control in (name, "both")
+    ]
+    return spec_with_roles(
+        roles,
         name="predator-prey",
         version=1,
         convention=f"{settings.convention}: {reward}, {opponent}, {order}{settings.broken_in_words()}",
-        num_agents=1 if prey_learns else settings.num_predators,
         horizon=settings.horizon,
-        observation=prey_layout(settings) if prey_learns else _predator_layout(settings),
         state=_state_layout(settings),
-        action=MOVES if discrete else FORCE,
         symmetry=settings.left_of(whole, *learned),
         nearly=whole,
-        shared_reward=True,
         settings=settings.model_dump(),
     )
 
@@ -106,7 +113,8 @@ def prey_layout(settings: PredatorPreySettings) -> Layout:
 
 def _state_layout(settings: PredatorPreySettings) -> Layout:
     predators = settings.num_predators
-    hunters, hunted = (Items.FIXED, Items.AGENTS) if settings.control == "prey" else (Items.AGENTS, Items.FIXED)
+    learns = {"predators": Items.FIXED, "prey": Items.FIXED} | {settings.control: Items.AGENTS}
+    hunters, hunted = learns["predators"], learns["prey"]
     return filled_layout(
         Field("velocity", Kind.VECTOR, predators, "length/s", hunters, family="predators"),
         Field("prey_velocity", Kind.VECTOR, 1, "length/s", hunted, family="prey"),
