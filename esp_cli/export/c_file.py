@@ -9,7 +9,7 @@ import ctypes
 import re
 import shutil
 import subprocess
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +18,7 @@ import numpy as np
 from esp_cli.export.check import Numbers, Runner
 from esp_cli.export.layers import Floats, literal
 from esp_cli.export.program import SQUASH_EPSILON, Program
+from esp_cli.export.sets import named
 from esp_cli.export.templates import RUNTIME, filled
 from esp_envs.errors import UserError
 
@@ -36,6 +37,7 @@ class Cost:
 def cost(program: Program) -> Cost:
     """Return what a program in C needs."""
     scratch = 2 * program.team * _row_width(program) + 6 * program.hidden
+    scratch += sum(layer.scratch for layer in program.layers)
     return Cost(len(program.weights), 4 * (scratch + program.memory_width))
 
 
@@ -65,9 +67,17 @@ def c_source(program: Program, comment: str) -> dict[str, bytes]:
     return {name: filled(name, **values) for name in ("policy.h", "policy.c")}
 
 
-def example_source(program: Program, observation: list[float], action: list[float], allowed: list[bool]) -> bytes:
+def example_source(
+    program: Program,
+    sets: Mapping[str, Sequence[Sequence[float]]],
+    observation: list[float],
+    action: list[float],
+    allowed: list[bool],
+) -> bytes:
     """Return a program that acts on the worked example (of a team all rows), and says whether it acts as it should."""
     choose = program.head == "choose"
+    tables = dict(zip(named([*sets]), sets.values(), strict=True))
+    beside = [part for name, rows in tables.items() for part in (f"set_{name}", str(len(rows)))]
     return filled(
         "policy_example.c",
         program=program,
@@ -76,7 +86,10 @@ def example_source(program: Program, observation: list[float], action: list[floa
         observation=numbers(observation),
         expected=", ".join(str(int(x)) if choose else literal(x) for x in action),
         allowed=", ".join(str(int(flag)) for flag in allowed),
-        given=", ".join(["observation", *["allowed"] * program.masked, *["memory"] * (program.memory_width > 0)]),
+        sets=[(f"set_{name}", numbers(number for row in rows for number in row)) for name, rows in tables.items()],
+        given=", ".join(
+            ["observation", *beside, *["allowed"] * program.masked, *["memory"] * (program.memory_width > 0)]
+        ),
     )
 
 
@@ -95,6 +108,8 @@ def _row_width(program: Program) -> int:
 def _signature(program: Program) -> str:
     agents = "ESP_POLICY_AGENTS * " if program.team > 1 else ""
     parameters = [f"const float observation[{agents}ESP_POLICY_OBSERVATION]"]
+    for name in named([name for name, _ in program.sets]):
+        parameters += [f"const float *set_{name}", f"int num_{name}"]
     parameters += [f"const unsigned char allowed[{agents}ESP_POLICY_ACTION]"] if program.masked else []
     parameters += ["float memory[ESP_POLICY_MEMORY]"] if program.memory_width else []
     parameters += ["float action[ESP_POLICY_ACTION]"] if program.head == "squash" else []
@@ -119,7 +134,7 @@ def _body(program: Program) -> str:
         copied = f"memory + {program.hidden}, sizeof(float) * {program.previous}"
         lines.append(f"memcpy(x + ESP_POLICY_OBSERVATION, {copied});")
     for k, layer in enumerate(program.layers):
-        lines += re.sub(r"\bw(\d)\b", rf"w{k}_\1", layer.c).splitlines()
+        lines += re.sub(r"\bw(\d+)\b", rf"w{k}_\1", layer.c).splitlines()
     lines.append("last = x;")
     if program.team > 1:
         call = "choose_allowed(X, allowed + i * ESP_POLICY_ACTION)" if program.masked else "choose(X)"
@@ -161,14 +176,18 @@ def c_runner(file: Path, program: Program) -> Runner:
     code.esp_policy_outputs.restype = ctypes.POINTER(ctypes.c_float)
     code.esp_policy_act.restype = ctypes.c_int if choose and team == 1 else None
 
-    def run(obs: Floats, memory: Floats, mask: Numbers | None = None) -> tuple[Numbers, Numbers, Numbers]:
+    def run(
+        obs: Floats, memory: Floats, mask: Numbers | None = None, sets: dict[str, Floats] | None = None
+    ) -> tuple[Numbers, Numbers, Numbers]:
         obs, after = np.ascontiguousarray(obs), memory.copy()
         outputs = np.empty((len(obs), width), np.float32)
         action: Numbers = np.empty(len(obs), np.intc) if choose else np.empty_like(outputs)
         written = [after] * (program.memory_width > 0) + [action] * (not choose or team > 1)
-        arrays = [obs, *([] if mask is None else [mask.astype(np.uint8)]), *written]
+        tables = [np.ascontiguousarray(table) for table in (sets or {}).values()]
+        arrays = [*([] if mask is None else [mask.astype(np.uint8)]), *written]
         for k in range(0, len(obs), team):
-            chosen = code.esp_policy_act(*(ctypes.c_void_p(array[k:].ctypes.data) for array in arrays))
+            given = [part for table in tables for part in (_address(table, k), table.shape[1])]
+            chosen = code.esp_policy_act(_address(obs, k), *given, *(_address(array, k) for array in arrays))
             if choose and team == 1:
                 action[k] = chosen
             for i in range(team):
@@ -177,6 +196,10 @@ def c_runner(file: Path, program: Program) -> Runner:
         return action, outputs, after
 
     return run
+
+
+def _address(array: Numbers, row: int) -> ctypes.c_void_p:
+    return ctypes.c_void_p(array[row:].ctypes.data)
 
 
 def example_runs(folder: Path) -> bool:

@@ -47,7 +47,8 @@ def describe(trained: TrainedPolicy, program: Program, sample: Sample) -> dict[s
         "observation": _fields(spec.observation),
         "action": _action(spec),
         "memory": {"hidden": program.hidden, "previous_action": program.previous},
-        "example": {name: array[first].tolist() for name, array in rows.items() if array is not None},
+        "example": {name: array[first].tolist() for name, array in rows.items() if array is not None}
+        | ({"sets": {name: table[first].tolist() for name, table in sample.sets.items()}} if sample.sets else {}),
     }
 
 
@@ -85,6 +86,12 @@ def spaces(spec: TaskSpec, program: Program) -> list[str]:
     if program.team > 1:
         lines.append(
             f"The {program.team} agents of a world exchange messages and act together: their rows are adjacent."
+        )
+    if program.sets:
+        names = ", ".join(f"{name} {len(columns[0])}" for name, columns in program.sets)
+        lines.append(
+            f"The policy takes the {program.num_inputs} own numbers as its observation, and beside them a table "
+            f"of each set, with a row for each thing, as many as there are, at least one; numbers of a row: {names}."
         )
     lines += ["The frame is the world's: x to the right, y up, angles counter-clockwise in radians."]
     lines.append("Action of one agent:")

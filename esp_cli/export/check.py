@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -25,8 +25,9 @@ TOLERANCE = 1e-4
 _STEPS = 50
 
 Numbers = NDArray[Any]
-Runner = Callable[[Floats, Floats, Numbers | None], tuple[Numbers, Numbers, Numbers]]
-"""(observation [B, D], memory [B, H], action mask [B, A] or None) to (action [B] or [B, width], outputs [B, O], memory
+Runner = Callable[..., tuple[Numbers, Numbers, Numbers]]
+"""(observation [B, D], memory [B, H], action mask [B, A] or None, tables [B, K, W] of sets by name where there are
+some) to (action [B] or [B, width], outputs [B, O], memory
 after [B, H])."""
 
 
@@ -40,6 +41,11 @@ class Sample:
     action: Numbers
     after: Floats
     mask: Numbers | None = None
+    sets: dict[str, Floats] = field(default_factory=dict)  # beside own numbers; see `Program`
+
+    def run(self, runner: Runner, obs: Floats) -> tuple[Numbers, Numbers, Numbers]:
+        """Run an export on observations as many as the sample's."""
+        return runner(obs, self.memory, self.mask, *([self.sets] if self.sets else []))
 
     @property
     def choosable(self) -> Floats:
@@ -63,7 +69,7 @@ def take_sample(trained: TrainedPolicy, program: Program, count: int = OBSERVATI
     obs, memory, mask = _play(trained, _whole(count // 2, program.team))
     missing = _whole(count - len(obs), program.team)
     rng = np.random.default_rng(0)
-    obs = torch.cat([obs, torch.from_numpy(rng.standard_normal((missing, program.num_inputs), np.float32))])
+    obs = torch.cat([obs, torch.from_numpy(rng.standard_normal((missing, obs.shape[1]), np.float32))])
     drawn = rng.uniform(-1, 1, (missing, program.memory_width)).astype(np.float32)
     if program.previous and program.head == "choose":
         drawn[:, program.hidden :] = np.eye(program.previous)[rng.integers(program.previous, size=missing)]
@@ -74,7 +80,8 @@ def take_sample(trained: TrainedPolicy, program: Program, count: int = OBSERVATI
     action, after = trained.policy.act(obs[None, None], memory[None], action_mask=allowed)
     outputs = _raw_outputs(trained.policy, obs, memory)
     masks = None if mask is None else mask.numpy()
-    return Sample(obs.numpy(), memory.numpy(), outputs.numpy(), action[0, 0].numpy(), after[0].numpy(), masks)
+    own, sets = program.split(obs.numpy())
+    return Sample(own, memory.numpy(), outputs.numpy(), action[0, 0].numpy(), after[0].numpy(), masks, sets)
 
 
 def _whole(count: int, team: int) -> int:
@@ -110,7 +117,7 @@ def compare(sample: Sample, runner: Runner) -> Agreement:
         RuntimeError: they do not agree, which is a bug.
         UserError: they cannot agree, since the rounding of the observations moves the outputs as far.
     """
-    action, outputs, after = runner(sample.obs, sample.memory, sample.mask)
+    action, outputs, after = sample.run(runner, sample.obs)
     largest = max(1.0, float(np.abs(sample.outputs).max()))
     gap = float(np.abs(outputs - sample.outputs).max())
     chooses, ties = sample.action.dtype.kind == "i", True
@@ -132,7 +139,7 @@ def compare(sample: Sample, runner: Runner) -> Agreement:
 def _refuse_ill_conditioned(sample: Sample, runner: Runner, outputs: Floats, most: float) -> None:
     """Raise a UserError where the rounding of float32 in observations moves an output by more than `most`."""
     rounded = np.nextafter(sample.obs, np.float32(np.inf))
-    moved = float(np.abs(runner(rounded, sample.memory, sample.mask)[1] - outputs).max())
+    moved = float(np.abs(sample.run(runner, rounded)[1] - outputs).max())
     if moved > most:
         raise UserError(
             f"the policy gives outputs {moved:g} apart for observations that differ by the rounding of float32, so "

@@ -82,8 +82,9 @@ class Exported:
 def _c(job: Job) -> Files:
     example = job.description["example"]
     rows = (np.ravel(example.get(name, [])).tolist() for name in ("observation", "action", "action_mask"))
+    sets = example.get("sets", {})
     files = c_file.c_source(job.program, summary(job.trained, job.program))
-    files |= {"policy_example.c": c_file.example_source(job.program, *rows)}
+    files |= {"policy_example.c": c_file.example_source(job.program, sets, *rows)}
     return files if job.scenes is None else files | epuck.c_files(job.description)
 
 
@@ -229,7 +230,7 @@ def _readme(job: Job, results: Sequence[Export]) -> bytes:
         title=title(job.trained),
         version=__version__,
         spaces="\n".join(spaces(spec, job.program)),
-        example=[(k, shortly(v)) for k, v in description["example"].items() if not k.startswith("memory")],
+        example=[(k, shortly(v)) for k, v in description["example"].items() if not k.startswith(("memory", "sets"))],
         results=results,
         spec=spec,
         program=job.program,

@@ -84,6 +84,57 @@ static void aggregate(const float *ways, int width, float reach_squared, float r
     }
 }
 
+static float apart(const float *a, const float *b)
+{
+    return (a[0] - b[0]) * (a[0] - b[0]) + (a[1] - b[1]) * (a[1] - b[1]);
+}
+
+static float farthest(const float *places, int count, int width, const float *from, float most)
+{
+    int j;
+    for (j = 0; j < count; j++) most = fmaxf(most, apart(places + j * width, from));
+    return most;
+}
+
+/* The square of the distance to the nearest other place; `none` where there is no other. */
+static float nearest(const float *at, const float *places, int count, int width, float none)
+{
+    int j, found = 0;
+    for (j = 0; j < count; j++) {
+        const float *place = places + j * width;
+        const float square = apart(at, place);
+        if (place != at && (!found || square < none)) none = square, found = 1;
+    }
+    return none;
+}
+
+/* Copies the `near` things with the nearest places, and returns how many they are. */
+static int nearest_things(const float *things, int count, int width, int place, const float *from, int near,
+                          float *to)
+{
+    int i, j, copied = 0;
+    for (i = 0; i < count; i++) {
+        const float mine = apart(things + i * width + place, from);
+        int before = 0;
+        for (j = 0; j < count && before < near; j++) {
+            const float square = apart(things + j * width + place, from);
+            before += square < mine || (square == mine && j < i);
+        }
+        if (before < near && copied < near) memcpy(to + width * copied++, things + i * width, sizeof(float) * width);
+    }
+    return copied;
+}
+
+/* Adds the features of the i-th of `count` things to their mean, and takes the maximum behind it. */
+static void pool(int features, int i, int count, const float *x, float *y)
+{
+    int k;
+    for (k = 0; k < features; k++) {
+        y[k] = (i ? y[k] : 0.0f) + x[k] / (float)count;
+        y[features + k] = i && !(x[k] > y[features + k]) ? y[features + k] : x[k];
+    }
+}
+
 static float sigmoid(float x)
 {
     return 0.5f + 0.5f * tanhf(0.5f * x);

@@ -30,18 +30,19 @@ class Layer:
 
     In C (in the macros of `templates/policy.c.jinja`) and ONNX (its text format, an operation a line) w0, w1, ... stand
     for the arrays; in ONNX numbers stand for constants. `torch` makes y [rows, width] of x, the arrays, and the
-    observations [rows, D]; the kind `gru` takes the hidden state [rows, H] instead of the latter.
+    observations [rows, D]; the kind `gru` takes the hidden state [rows, H] instead of the latter, `sets` the tables.
     """
 
     kind: str  # its name in JSON
     flops: int  # for one row: each addition, multiplication, comparison or call of tanh, exp or sqrt is one
     c: str
     onnx: str
-    torch: Callable[[Tensor, list[Tensor], Tensor], Tensor]
+    torch: Callable[[Tensor, list[Tensor], Any], Tensor]
     arrays: tuple[Floats, ...] = ()  # learned numbers, in the order in which exports store them
     onnx_arrays: tuple[Floats, ...] = ()  # what ONNX stores instead of them, where that differs
-    numbers: tuple[tuple[str, float], ...] = ()  # what JSON says of it, beside the shapes of the arrays
+    numbers: tuple[tuple[str, object], ...] = ()  # what JSON says of it, beside the shapes of the arrays
     width: int = 0  # of the widest row that it reads or writes, where another layer does not tell
+    scratch: int = 0  # numbers that C keeps beside rows
 
     def describe(self) -> dict[str, object]:
         """Return the layer as JSON stores it: without its weights, but with their shapes."""

@@ -38,12 +38,14 @@ def numpy_runner(file: Path) -> Runner:
     spec.loader.exec_module(module)
     policy = module.POLICY
 
-    def run(obs: Floats, memory: Floats, mask: Numbers | None = None) -> tuple[Numbers, Numbers, Numbers]:
+    def run(
+        obs: Floats, memory: Floats, mask: Numbers | None = None, sets: dict[str, Floats] | None = None
+    ) -> tuple[Numbers, Numbers, Numbers]:
         count, team = len(obs), policy.program["team"]
         lead = (count // team, team) if team > 1 else (count,)
         inputs = [rows.reshape(*lead, rows.shape[1]) for rows in (obs, memory)]
         allowed = None if mask is None else mask.reshape(*lead, mask.shape[1])
-        results = (*policy.step(*inputs, allowed), policy.outputs(*inputs)[0])
+        results = (*policy.step(*inputs, allowed, sets), policy.outputs(*inputs, sets)[0])
         action, after, outputs = (rows.reshape(count, *rows.shape[len(lead) :]) for rows in results)
         return action, outputs, after
 

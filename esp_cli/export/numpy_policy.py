@@ -30,22 +30,23 @@ class NumpyPolicy:
         if numbers.size:
             raise ValueError("the weights do not fit the layers; export the policy again")
 
-    def act(self, obs: Any, action_mask: Any = None) -> Any:
+    def act(self, obs: Any, action_mask: Any = None, sets: Any = None) -> Any:
         """Return the actions [...] or [..., width] of agents that see obs [..., D], a team's [..., N, D].
 
-        A policy with masks needs the allowed actions [..., A], too.
+        A policy with masks needs the allowed actions [..., A], too; one over sets tables of their things [..., K, W] by
+        name.
         """
         if self.hidden:
             raise ValueError("this policy remembers: begin with initial_memory(), and call step(obs, memory)")
-        return self.step(obs, self.initial_memory(*np.shape(obs)[:-1]), action_mask)[0]
+        return self.step(obs, self.initial_memory(*np.shape(obs)[:-1]), action_mask, sets)[0]
 
     def initial_memory(self, *lead: int) -> Any:
         """Return the memory with which an episode begins: zeros [*lead, H]."""
         return np.zeros((*lead, self.hidden + self.previous), np.float32)
 
-    def step(self, obs: Any, memory: Any, action_mask: Any = None) -> tuple[Any, Any]:
+    def step(self, obs: Any, memory: Any, action_mask: Any = None, sets: Any = None) -> tuple[Any, Any]:
         """Return actions, and the memory [..., H] after them."""
-        outputs, hidden = self.outputs(obs, memory)
+        outputs, hidden = self.outputs(obs, memory, sets)
         if self.program["head"] == "choose":
             action = self._allowed(outputs, action_mask).argmax(-1)
             encoded = np.eye(outputs.shape[-1], dtype=np.float32)[action]
@@ -53,7 +54,7 @@ class NumpyPolicy:
             action = encoded = self._squash(outputs)
         return action, np.concatenate([hidden, encoded], -1) if self.previous else hidden
 
-    def outputs(self, obs: Any, memory: Any) -> tuple[Any, Any]:
+    def outputs(self, obs: Any, memory: Any, sets: Any = None) -> tuple[Any, Any]:
         """Return the last layer's outputs (logits, values or unbounded actions), and the hidden state after it."""
         x, memory = np.asarray(obs, np.float32), np.asarray(memory, np.float32)
         if x.shape[-1:] != (self.program["num_inputs"],):
@@ -62,13 +63,25 @@ class NumpyPolicy:
             raise ValueError(f"the observation has shape {x.shape}, but (..., {self.program['team']}, D) is needed")
         if memory.shape != (*x.shape[:-1], self.hidden + self.previous):
             raise ValueError(f"the memory has shape {memory.shape}, but initial_memory{x.shape[:-1]} is needed")
+        sets = self._tables(sets or {}, x.shape[:-1])
         hidden = memory[..., : self.hidden]
         obs, x = x, np.concatenate([x, memory[..., self.hidden :]], -1)
         for layer, arrays in self.layers:
             remembers = layer["kind"] == "gru"
-            x = LAYERS[layer["kind"]](x, layer, arrays, hidden if remembers else obs)
+            x = LAYERS[layer["kind"]](x, layer, arrays, {"gru": hidden, "sets": sets}.get(layer["kind"], obs))
             hidden = x if remembers else hidden
         return x, hidden
+
+    def _tables(self, sets: Any, lead: tuple[int, ...]) -> Any:
+        """Return the tables of sets as float32; there is at least one thing in each."""
+        widths = {name: len(columns[0]) for name, columns in self.program["sets"]}
+        if {*sets} != {*widths}:
+            raise ValueError(f"the sets are {sorted(sets)}, but {sorted(widths)} are needed")
+        tables = {name: np.asarray(table, np.float32) for name, table in sets.items()}
+        for name, table in tables.items():
+            if table.ndim < 2 or table.shape != (*lead, max(1, table.shape[-2]), widths[name]):
+                raise ValueError(f"{name} has shape {table.shape}, but {(*lead, 'K', widths[name])} is needed, K > 0")
+        return tables
 
     def _allowed(self, outputs: Any, action_mask: Any) -> Any:
         """Put those of forbidden actions out of reach; where none is allowed, all are."""
@@ -128,6 +141,38 @@ def _aggregate(x: Any, layer: dict[str, Any], _: list[Any], obs: Any) -> Any:
     return np.concatenate([x, (share * (ways / np.sqrt(reach_squared))).sum(-2), messages], -1)
 
 
+def _pool_sets(x: Any, layer: dict[str, Any], arrays: list[Any], tables: Any) -> Any:
+    """Concatenate own numbers with mean and maximum over the embedded things of each set."""
+    act = np.tanh if layer["activation"] == "tanh" else lambda x: np.maximum(x, 0)
+    own, weights = x[..., layer["kept"]], arrays
+    if layer["embeds_own"]:
+        own, weights = act(own @ arrays[0] + arrays[1]), arrays[2:]
+    things, places = [], {}
+    for name, at, reader in layer["sets"]:
+        table = tables[name]
+        if at is not None and 0 < layer["near"] < table.shape[-2]:
+            here = 0 if reader is None else x[..., None, reader : reader + 2]
+            order = np.square(table[..., at : at + 2] - here).sum(-1).argsort(-1)[..., : layer["near"], None]
+            table = np.take_along_axis(table, order, -2)
+        things.append(table)
+        if at is not None:
+            places[name] = table[..., at : at + 2]
+    parts, squares = [own], [np.square(place).sum(-1) for place in places.values()]
+    farthest = 4 * np.concatenate(squares, -1).max(-1, keepdims=True) if squares else 0
+    for k, (table, (name, at, _)) in enumerate(zip(things, layer["sets"], strict=True)):
+        first, shared, bias, second, second_bias = weights[5 * k : 5 * k + 5]
+        columns = [table] if at is None else [table, np.sqrt(np.square(places[name]).sum(-1, keepdims=True))]
+        for other, place in places.items() if at is not None else ():
+            square = np.square(places[name][..., :, None, :] - place[..., None, :, :]).sum(-1)
+            square = np.where(np.eye(table.shape[-2], dtype=bool), np.inf, square) if other == name else square
+            least = square.min(-1)
+            columns.append(np.sqrt(np.where(np.isinf(least), farthest, least))[..., None])
+        rows = np.concatenate(columns, -1) @ first + (own @ shared + bias)[..., None, :]
+        embedded = act(act(rows) @ second + second_bias)
+        parts += [embedded.mean(-2), embedded.max(-2)]
+    return np.concatenate([*parts, x[..., layer["inputs"] :]], -1)
+
+
 LAYERS = {
     "affine": lambda x, _, arrays, *__: x @ arrays[0] + arrays[1],
     "relu": lambda x, *_: np.maximum(x, 0),
@@ -138,5 +183,6 @@ LAYERS = {
     "convolution": _convolve,
     "global_max_pool": lambda x, layer, *_: x.reshape(*x.shape[:-1], layer["channels"], layer["places"]).max(-1),
     "aggregate": _aggregate,
+    "sets": _pool_sets,
 }
 """What a layer makes of rows x [..., width], with its arrays and the observations (a gru: its hidden state)."""

@@ -15,6 +15,7 @@ from esp_cli.defaults import __version__
 from esp_cli.export.check import Numbers, Runner
 from esp_cli.export.layers import Floats, Layer
 from esp_cli.export.program import SQUASH_EPSILON, Program
+from esp_cli.export.sets import named
 from esp_envs.errors import UserError
 from esp_envs.installed import install
 
@@ -54,8 +55,9 @@ def onnx_model(program: Program, description: str) -> bytes:
     """Write a program as an ONNX model.
 
     Inputs: `observation` [rows, D]; of a recurrent policy `memory` [rows, H]; of one with masks `action_mask` [rows, A]
-    bool. Outputs: `action` ([rows] int64 or [rows, width] float32), `outputs` [rows, outputs] of the last layer, and
-    `memory_out` [rows, H]. A team's rows stand side by side, world after world.
+    bool; of a network over sets `set_NAME` [rows, K, W]. Outputs: `action` ([rows] int64 or [rows, width] float32),
+    `outputs` [rows, outputs] of the last layer, and `memory_out` [rows, H]. A team's rows stand side by side, world
+    after world.
 
     The description, which is JSON, goes into the model's metadata.
     """
@@ -68,6 +70,8 @@ def onnx_model(program: Program, description: str) -> bytes:
         inputs.append(f"float[rows, {program.memory_width}] memory")
         outputs.append(f"float[rows, {program.memory_width}] memory_out")
         graph.add(f"hidden = Slice(memory, [0], [{program.hidden}], [1])")
+    tables = zip(named([name for name, _ in program.sets]), program.sets, strict=True)
+    inputs += [f"float[rows, things{k}, {len(c[0])}] set_{name}" for k, (name, (_, c)) in enumerate(tables)]
     if program.previous:
         graph.add(f"previous = Slice(memory, [{program.hidden}], [{program.memory_width}], [1])")
         graph.add("start = Concat<axis = 1>(observation, previous)")
@@ -140,8 +144,13 @@ def onnx_runner(file: Path) -> Runner:
     session = library("onnxruntime").InferenceSession(str(file), providers=["CPUExecutionProvider"])
     names = [value.name for value in session.get_inputs()]
 
-    def run(obs: Floats, memory: Floats, mask: Numbers | None = None) -> tuple[Numbers, Numbers, Numbers]:
+    def run(
+        obs: Floats, memory: Floats, mask: Numbers | None = None, sets: dict[str, Floats] | None = None
+    ) -> tuple[Numbers, Numbers, Numbers]:
         rows = {"observation": obs, "memory": memory, "action_mask": mask}
+        rows |= {
+            f"set_{name}": table for name, table in zip(named([*(sets or {})]), (sets or {}).values(), strict=True)
+        }
         results = session.run(None, {name: rows[name] for name in names})
         return results[0], results[1], results[2] if len(results) > 2 else memory
 

@@ -8,19 +8,21 @@ A program maps a row of observation, and of memory where it has one, to outputs,
     action = u tanh|u| / |u|               head `squash`, for each group u of x: a planar vector, or a single number
 
 The memory is [hidden state of the unit, previous action], the latter one-hot where it is a choice. Of a team, whose
-agents exchange messages, the rows of a world's agents are adjacent.
+agents exchange messages, the rows of a world's agents are adjacent. Of a network over
+sets the observation is the own numbers, and each set comes as a table of its things, as many as there are.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, cast
 
 import numpy as np
-from torch import Tensor
+from torch import Tensor, nn
 
 from esp_cli.export import layers
 from esp_cli.export.layers import Floats, Layer
+from esp_cli.export.sets import SetOf, pool_sets
 from esp_cli.networks.constrained import ConstrainedLinear, Equivariant
 from esp_cli.networks.contract import Network
 from esp_cli.networks.exploration import BoundedPoint, EpsilonGreedy, ExploringCategorical
@@ -29,6 +31,7 @@ from esp_cli.networks.layers import SeedLayerNorm, SeedLinear, SeedMLP
 from esp_cli.networks.message_passing import REACH_SQUARED, MessagePassing, PictureEncoder
 from esp_cli.networks.plain import GRU, MLP
 from esp_cli.networks.policy import HistoryPolicy, Policy
+from esp_cli.networks.sets import RecurrentSetNetwork, SetNetwork
 from esp_cli.networks.symmetrised import Separate
 from esp_envs.errors import UserError
 
@@ -48,6 +51,9 @@ class Program:
     groups: tuple[int, ...]  # widths of what is squashed together; empty where the head chooses
     team: int = 1  # agents that act together, with their rows side by side; 1 where each acts by itself
     masked: bool = False  # whether a mask of allowed actions [A] comes along; one that allows none allows all
+    # of a network over sets: where a task's observation has the own numbers, and each set's things with their numbers
+    own: tuple[int, ...] = ()
+    sets: tuple[tuple[str, tuple[tuple[int, ...], ...]], ...] = ()
 
     @property
     def memory_width(self) -> int:
@@ -68,6 +74,10 @@ class Program:
         own = self.num_outputs if self.head == "choose" else 5 * self.num_outputs
         return sum(layer.flops for layer in self.layers) + own
 
+    def split(self, obs: Floats) -> tuple[Floats, dict[str, Floats]]:
+        """Return what the program reads of a task's observations [B, D]: own numbers [B, d], tables [B, K, W]."""
+        return (obs[:, self.own] if self.sets else obs), {name: obs[:, columns] for name, columns in self.sets}
+
     def describe(self) -> dict[str, object]:
         """Return the program without its weights, as JSON stores it."""
         return vars(self) | {"layers": [layer.describe() for layer in self.layers]}
@@ -80,16 +90,18 @@ def program_of(policy: Policy, masked: bool = False) -> Program:
     if isinstance(actor, Separate):  # the sums of an action's parts are one more layer
         parts = _plain(actor.parts)
         actor, sums = actor.network, [layers.affine(parts, np.zeros(parts.shape[1], np.float32))]
-    own = _network(actor)
+    previous = policy.head.num_outputs if isinstance(policy, HistoryPolicy) and policy.recurrent else 0
+    own, sets = _sets(actor, previous) if isinstance(actor, SetNetwork | RecurrentSetNetwork) else (_network(actor), {})
     if isinstance(head, Categorical | ExploringCategorical | EpsilonGreedy):
         groups: tuple[int, ...] = ()
     elif isinstance(head, BoundedGaussian | BoundedPoint):
         groups = _groups(head.disc)
     else:
         raise UserError(f"a head of the kind {type(head).__name__} cannot be exported")
-    previous = policy.head.num_outputs if isinstance(policy, HistoryPolicy) and policy.recurrent else 0
     if isinstance(actor, MessagePassing):
         inputs = max(actor.picture.stop, actor.others.stop)
+    elif sets:
+        inputs = len(sets["own"]) + previous
     else:
         inputs = next(len(layer.arrays[0]) for layer in own if layer.kind == "affine")
     return Program(
@@ -102,6 +114,7 @@ def program_of(policy: Policy, masked: bool = False) -> Program:
         groups=groups,
         team=actor.team,
         masked=masked,
+        **sets,
     )
 
 
@@ -118,9 +131,40 @@ def _network(actor: Network) -> list[Layer]:
     if isinstance(actor, MessagePassing):
         return _message_passing(actor)
     raise UserError(
-        f"a network of the kind {type(actor).__name__} cannot be exported; mlp, gru, equivariant, mpn and empn can, "
-        "without symmetrise"
+        f"a network of the kind {type(actor).__name__} cannot be exported; mlp, gru, set, equivariant, mpn and empn "
+        "can, without symmetrise"
     )
+
+
+def _sets(actor: SetNetwork | RecurrentSetNetwork, previous: int) -> tuple[list[Layer], dict[str, Any]]:
+    """Return layers, and where an observation has what they read."""
+    encoder, rows = actor.features.encoder, actor.features.encoder.rows
+    if rows.places or not rows.own:
+        raise UserError(
+            "set cannot be exported where a task with shifts shows several places, or no number is the agent's own"
+        )
+    columns = [column for part in rows.layout.own for column in range(part.where.start, part.where.stop)]
+    kept = [columns.index(column) for where in rows.own for column in range(where.start, where.stop)]
+    own = () if encoder.own is None else _arrays(encoder.own.layers[0])
+    sets = []
+    for family, place, reader, embed in zip(
+        rows.families, rows.offsets, rows.readers, encoder.embed.values(), strict=True
+    ):
+        (first, bias), second = map(_arrays, cast("nn.ModuleList", embed.layers))
+        width = len(first) - encoder.num_own
+        things = tuple(
+            tuple(
+                part.where.start + k * part.field.item_width + i
+                for part in family.parts
+                for i in range(part.field.item_width)
+            )
+            for k in range(family.count)
+        )
+        at = None if reader is None else columns.index(reader)
+        sets.append(SetOf(family.name, things, place, at, (first[:width], first[width:], bias, *second)))
+    features = pool_sets(sets, own, kept, len(columns), previous, rows.near, actor.activation)
+    found = {"own": tuple(columns), "sets": tuple((each.name, each.columns) for each in sets)}
+    return [features, *(_perceptron(actor.head) if isinstance(actor, SetNetwork) else _network(actor.unit))], found
 
 
 def _message_passing(actor: MessagePassing) -> list[Layer]:

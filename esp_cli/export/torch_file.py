@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -19,7 +20,7 @@ class TorchProgram(nn.Module):
 
     Shape:
         observation: [rows, D]; memory: [rows, H], for recurrent policies; action_mask: [rows, A] bool, for those with
-        masks.
+        masks; sets: tables [rows, K, W] by name, for networks over sets.
         Returns action ([rows] int64 or [rows, width]), outputs [rows, outputs] and, if recurrent, memory [rows, H].
         A team's rows stand side by side, world after world.
     """
@@ -32,7 +33,11 @@ class TorchProgram(nn.Module):
                 self.register_buffer(f"w{k}_{i}", torch.from_numpy(array.copy()))
 
     def forward(
-        self, observation: Tensor, memory: Tensor | None = None, action_mask: Tensor | None = None
+        self,
+        observation: Tensor,
+        memory: Tensor | None = None,
+        action_mask: Tensor | None = None,
+        sets: dict[str, Tensor] | None = None,
     ) -> tuple[Tensor, ...]:
         program, x = self.program, observation
         hidden = x[:, :0] if memory is None else memory[:, : program.hidden]
@@ -40,7 +45,7 @@ class TorchProgram(nn.Module):
             x = torch.cat([x, memory[:, program.hidden :]], 1)
         for k, layer in enumerate(program.layers):
             arrays = [self.get_buffer(f"w{k}_{i}") for i in range(len(layer.arrays))]
-            x = layer.torch(x, arrays, hidden if layer.kind == "gru" else observation)
+            x = layer.torch(x, arrays, {"gru": hidden, "sets": sets}.get(layer.kind, observation))
             hidden = x if layer.kind == "gru" else hidden
         if program.head == "choose":
             action = masked(x, action_mask).argmax(-1)
@@ -66,10 +71,14 @@ def torch_archive(program: Program, description: str) -> bytes:
     inputs = {"observation": torch.zeros(2 * program.team, program.num_inputs)}
     if program.memory_width:
         inputs["memory"] = torch.zeros(2 * program.team, program.memory_width)
-    arguments, named = tuple(inputs.values()), {}
+    arguments, named = tuple(inputs.values()), dict[str, Any]()
     if program.masked:
         named["action_mask"] = torch.ones(2 * program.team, program.num_outputs, dtype=torch.bool)
-    shapes = {name: {0: rows} for name in inputs | named}
+    shapes: dict[str, Any] = {name: {0: rows} for name in inputs | named}
+    if program.sets:
+        widths = {name: len(columns[0]) for name, columns in program.sets}
+        named["sets"] = {name: torch.zeros(2, 3 + k, width) for k, (name, width) in enumerate(widths.items())}
+        shapes["sets"] = {name: {0: rows, 1: torch.export.Dim(f"things{k}")} for k, name in enumerate(widths)}
     exported = torch.export.export(TorchProgram(program).eval(), arguments, named, dynamic_shapes=shapes)
     content = BytesIO()
     torch.export.save(exported, content, extra_files={"policy.json": description})
@@ -80,8 +89,12 @@ def torch_runner(file: Path) -> Runner:
     """Run a written torch.export archive."""
     module = torch.export.load(file).module()
 
-    def run(obs: Floats, memory: Floats, mask: Numbers | None = None) -> tuple[Numbers, Numbers, Numbers]:
-        allowed = {} if mask is None else {"action_mask": torch.from_numpy(mask)}
+    def run(
+        obs: Floats, memory: Floats, mask: Numbers | None = None, sets: dict[str, Floats] | None = None
+    ) -> tuple[Numbers, Numbers, Numbers]:
+        allowed: dict[str, Any] = {} if mask is None else {"action_mask": torch.from_numpy(mask)}
+        if sets:
+            allowed["sets"] = {name: torch.from_numpy(table) for name, table in sets.items()}
         inputs = [torch.from_numpy(array) for array in (obs, memory) if array.shape[1]]
         with torch.no_grad():
             results = [result.numpy() for result in module(*inputs, **allowed)]

@@ -77,11 +77,14 @@ def build_network(
     output_gain: float,
     io: IoSpec | None = None,
 ) -> Network:
-    """Build the network of the settings; `io` says what rows mean, for symmetry and the average over a group."""
+    """Build the network of the settings; `io` says what rows mean, for symmetry and the average over a group.
+
+    Further numbers may stand behind what `io` says.
+    """
     network = config.build(generators, inputs, outputs, output_gain, io)
     if config.symmetrise is None:
         return network
-    if io is None:
+    if io is None or inputs != io.layout.width:
         raise UserError(
             f"network.symmetrise averages over images of the observation alone, but this {config.name} reads more; "
             "leave it off, or choose a network without memory"

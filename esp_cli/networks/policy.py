@@ -47,8 +47,7 @@ class Policy(nn.Module):
             parts = action_parts(spec.action)
             self.actor: Network = Separate(build_network(generators, inputs, len(parts), network, output_gain), parts)
         else:
-            io = None if num_extra else IoSpec(spec, "own")
-            self.actor = build_network(generators, inputs, head.num_outputs, network, output_gain, io)
+            self.actor = build_network(generators, inputs, head.num_outputs, network, output_gain, IoSpec(spec, "own"))
 
     def initial_memory(self, num_envs: int, like: Tensor) -> Tensor:
         """Return the memory [S, E * N, H] with which an episode begins."""

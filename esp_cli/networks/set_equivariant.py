@@ -36,6 +36,8 @@ class SetEquivariantConfig(SetConfig):
         self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
     ) -> Network:
         io = sets_or_refuse(self.name, self.io_or_refuse(io))
+        if self.memory:
+            raise UserError("set-equivariant remembers nothing; use set with network.memory")
         if io.num_values is not None:
             return SetNetwork(generators, io, outputs, self, output_gain)
         action = io.spaces.action
@@ -80,7 +82,7 @@ class InvariantRows(Rows):
         self, layout: Layout, shifts: bool, near: int, compiled: bool, points: Sequence[Sequence[float]] = ()
     ) -> None:
         super().__init__(layout, shifts, near, compiled)
-        self.own_columns = _columns([part.field for part in layout.own if part.where in self._own])
+        self.own_columns = _columns([part.field for part in layout.own if part.where in self.own])
         one = [[_one(part.field) for part in family.parts] for family in self.families]
         self.columns = [_columns(fields) for fields in one]
         count = len(self.own_columns[0])

@@ -54,7 +54,10 @@ class Rows:
         compiled: whether distances are computed by the kernel.
 
     Attributes:
-        num_own: own numbers.
+        own: where the own numbers lie in a row; `num_own` of them are read.
+        places: of what is taken from the middle of all places.
+        offsets: for each family the number at which a thing's place begins.
+        readers: for each family where the reader's place begins in a row; None where it is the origin.
         families: sets of like things.
         widths: W of each family.
     """
@@ -63,20 +66,21 @@ class Rows:
         parts = [*layout.own, *(part for family in layout.families for part in family.parts)]
         places = [part.where for part in parts if shifts and part.field.is_point]
         alone = places if sum(where.stop - where.start for where in places) == 2 else []
-        self._places = [] if alone else places  # a single one, taken from itself, says nothing
-        self._own = [part.where for part in layout.own if part.where not in alone]
-        self.num_own = sum(where.stop - where.start for where in self._own)
-        self.families, self._near, self.compiled = layout.families, near, compiled
-        self._offsets = [_place(family) for family in layout.families]
+        self.places = [] if alone else places  # a single one, taken from itself, says nothing
+        self.own = [part.where for part in layout.own if part.where not in alone]
+        self.num_own = sum(where.stop - where.start for where in self.own)
+        self.layout, self.near, self.compiled = layout, near, compiled
+        self.families = layout.families
+        self.offsets = [_place(family) for family in layout.families]
         own = [part.where.start for part in layout.own if part.field.is_point]
-        self._readers = [
+        self.readers = [
             own[0]
             if own and any(part.is_point for field, _ in family.parts for part in field.parts or (field,))
             else None
             for family in layout.families
         ]
-        located = sum(at is not None for at in self._offsets)
-        each = zip(self.families, self._offsets, strict=True)
+        located = sum(at is not None for at in self.offsets)
+        each = zip(self.families, self.offsets, strict=True)
         self.widths = [family.width + (0 if at is None else 1 + located) for family, at in each]
 
     def split(self, x: Tensor) -> tuple[Tensor, list[list[Tensor]]]:
@@ -86,30 +90,30 @@ class Rows:
 
     def numbers(self, x: Tensor) -> tuple[Tensor, list[Tensor]]:
         """Return the own numbers [S, B, d] and those of the things of each family [S, B, K, .], undescribed."""
-        x = self._from_the_middle(x) if self._places else x
-        own = torch.cat([x[..., where] for where in self._own], -1) if self._own else x[..., :0]
+        x = self._from_the_middle(x) if self.places else x
+        own = torch.cat([x[..., where] for where in self.own], -1) if self.own else x[..., :0]
         things = []
-        for family, at, reader in zip(self.families, self._offsets, self._readers, strict=True):
+        for family, at, reader in zip(self.families, self.offsets, self.readers, strict=True):
             parts = [x[..., where].unflatten(-1, (family.count, -1)) for _, where in family.parts]
             joined = parts[0] if len(parts) == 1 else torch.cat(parts, -1)
-            if at is not None and 0 < self._near < family.count:
+            if at is not None and 0 < self.near < family.count:
                 ways = joined[..., at : at + 2] - (0 if reader is None else x[..., None, reader : reader + 2])
-                joined = _nearest(joined, ways, self._near)
+                joined = nearest_things(joined, ways, self.near)
             things.append(joined)
         return own, things
 
     def distances(self, things: Sequence[Tensor]) -> list[list[Tensor]]:
         """Return for each family the distances of its things, [S, B, K, .], or nothing where they have no place."""
-        each = zip(things, self._offsets, strict=True)
+        each = zip(things, self.offsets, strict=True)
         places = [numbers[..., at : at + 2] for numbers, at in each if at is not None]
         compiled = bool(places) and computes(self.compiled, places[0])
         found = iter((compiled_distances if compiled else distances_among)(places) if places else [])
-        return [[] if at is None else [next(found)] for at in self._offsets]
+        return [[] if at is None else [next(found)] for at in self.offsets]
 
     def _from_the_middle(self, x: Tensor) -> Tensor:
-        places = torch.cat([x[..., where] for where in self._places], -1)
+        places = torch.cat([x[..., where] for where in self.places], -1)
         middle, x = places.unflatten(-1, (-1, 2)).mean(-2), x.clone()
-        for where in self._places:
+        for where in self.places:
             x[..., where] -= middle.repeat(1, 1, (where.stop - where.start) // 2)
         return x
 
@@ -125,7 +129,7 @@ def _place(family: Family) -> int | None:
     return min(columns)[1] if columns else None
 
 
-def _nearest(things: Tensor, ways: Tensor, count: int) -> Tensor:
+def nearest_things(things: Tensor, ways: Tensor, count: int) -> Tensor:
     """Return the things [S, B, K, W] with the shortest ways [S, B, K, 2] to them."""
     which = ways.square().sum(-1).topk(count, -1, largest=False, sorted=False).indices
     return things.gather(2, which.unsqueeze(-1).expand(-1, -1, -1, things.shape[-1]))
@@ -141,15 +145,16 @@ def distances_among(places: Sequence[Tensor]) -> list[Tensor]:
         For each family [S, B, K, 1 + F]: the distance of a thing, and that between it and the nearest other thing of
         each family; where there is no other, twice the largest distance of any thing.
     """
-    described, farthest = [], 4 * torch.cat([*places], 2).square().sum(-1, keepdim=True).amax(2, keepdim=True)
+    described, farthest = [], 4 * torch.cat([*places], 2).square().sum(-1).amax(2, keepdim=True)
     for i, first in enumerate(places):
         columns = [first.square().sum(-1).sqrt()]
         for j, second in enumerate(places):
             square = (first.unsqueeze(3) - second.unsqueeze(2)).square().sum(-1)
             if i == j:
                 itself = torch.eye(first.shape[2], dtype=torch.bool, device=first.device)
-                square = torch.where(itself, farthest if len(itself) == 1 else torch.inf, square)
-            columns.append(square.amin(3).sqrt())
+                square = square.masked_fill(itself, torch.inf)
+            least = square.amin(3)
+            columns.append(torch.where(least.isinf(), farthest, least).sqrt())
         described.append(torch.stack(columns, -1))
     return described
 

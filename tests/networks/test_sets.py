@@ -339,3 +339,34 @@ def test_what_has_no_direction_is_refused_by_the_equivariant_network():
     wheels = make("formation", 1, [0], {"actions": "discrete"}).spec
     with pytest.raises(UserError, match="acts along directions of the plane; use set"):
         network(wheels, config=SetEquivariantConfig())
+
+
+def test_memory_behind_sets_unrolls_as_it_steps_and_knows_no_order():
+    spec, _ = scene()
+    built = build_network(
+        generators((0, 1), "x"),
+        spec.observation.width + 2,
+        5,
+        SetConfig(memory=True, hidden=(8,), width=4),
+        1.0,
+        IoSpec(spec, "own"),
+    )
+    x = torch.randn(2, 3, 4, spec.observation.width + 2, generator=torch.Generator().manual_seed(0))
+    memory, steps = built.initial_memory(2, 3, x), []
+    for t in range(4):
+        y, memory = built.step(x[:, :, t], memory)
+        steps.append(y)
+    whole = built.unroll(x)
+    torch.testing.assert_close(whole, torch.stack(steps, 2), **CLOSE)
+    exchanged, landmarks = x.clone(), spec.observation.slices()["landmarks"]
+    exchanged[:, :, 0, landmarks] = x[:, :, 0, landmarks].unflatten(-1, (-1, 2)).flip(-2).flatten(-2)
+    torch.testing.assert_close(built.unroll(exchanged), whole, **CLOSE)
+    for column in (landmarks.start, -1):  # a landmark of the first step and the last number behind are remembered
+        other = x.clone()
+        other[:, :, 0, column] += 1
+        assert not torch.allclose(built.unroll(other)[:, :, -1], whole[:, :, -1], **CLOSE)
+
+
+def test_the_equivariant_network_over_sets_remembers_nothing():
+    with pytest.raises(UserError, match="set-equivariant remembers nothing; use set"):
+        network(scene()[0], config=SetEquivariantConfig(memory=True))

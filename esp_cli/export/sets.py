@@ -1,0 +1,249 @@
+"""The layer of exports that reads sets of things: a table for each, with any number of rows; see `networks.sets`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from esp_cli.export.layers import Floats, Layer
+from esp_cli.networks.set_features import distances_among, nearest_things
+
+
+@dataclass(frozen=True)
+class SetOf:
+    """One set of things, and the weights that embed each of them.
+
+    Attributes:
+        name: of the set.
+        columns: of an observation, for each thing those of its numbers [K, W].
+        place: the number at which a thing's place begins; None where it has none.
+        reader: the own number at which the reader's place begins; None where it is the origin.
+        arrays: W_1 [W + distances, H] of a thing, V [own, H] of the own numbers, b_1 [H], W_2 [H, H] and b_2 [H].
+    """
+
+    name: str
+    columns: tuple[tuple[int, ...], ...]
+    place: int | None
+    reader: int | None
+    arrays: tuple[Floats, ...]
+
+    @property
+    def width(self) -> int:
+        """W, numbers of a thing."""
+        return len(self.columns[0])
+
+
+def named(sets: Sequence[str]) -> list[str]:
+    """Return the names of sets in C and ONNX."""
+    return [name if name.isidentifier() and name.isascii() else str(k) for k, name in enumerate(sets)]
+
+
+def pool_sets(
+    sets: Sequence[SetOf], own: tuple[Floats, ...], kept: Sequence[int], inputs: int, beside: int, near: int, kind: str
+) -> Layer:
+    """Return the own numbers, mean and maximum over each set's embedded things, and what stands beside.
+
+    Args:
+        sets: that come as tables.
+        own: W and b of a layer that embeds the own numbers; empty where they enter as they are.
+        kept: columns of the own numbers that are read.
+        inputs: own numbers of an observation.
+        beside: numbers behind them, which are passed on: the previous action.
+        near: things of each set that are read, the nearest ones; 0 for all.
+        kind: "relu" or "tanh".
+    """
+    features, num_own = len(sets[0].arrays[-1]), own[1].size if own else len(kept)
+    outputs = num_own + 2 * features * len(sets) + beside
+    located = sum(each.place is not None for each in sets)
+    pairs = [(len(each.columns), sum(len(other.columns) for other in sets if other.place is not None)) for each in sets]
+    of_things = sum(
+        count * (sum(2 * w.size for w in (each.arrays[0], each.arrays[3])) + 6 * features + 6 * others * bool(located))
+        for each, (count, others) in zip(sets, pairs, strict=True)
+    )
+    widest = max(len(each.arrays[0]) for each in sets)
+    structure = [(each.name, each.place, each.reader) for each in sets]
+
+    def pooled(x: Tensor, w: list[Tensor], tables: Mapping[str, Tensor]) -> Tensor:
+        weights, act = iter(w[len(own) :]), torch.relu if kind == "relu" else torch.tanh
+        seen = x[:, list(kept)]
+        seen = act(torch.addmm(w[1], seen, w[0])) if own else seen
+        things = []
+        for name, place, reader in structure:
+            table = tables[name].unsqueeze(0)
+            if near and place is not None:
+                ways = table[..., place : place + 2] - (0 if reader is None else x[:, None, reader : reader + 2])
+                table = nearest_things(table, ways, min(near, table.shape[2]))
+            things.append(table)
+        places = [t[..., p : p + 2] for t, (_, p, _) in zip(things, structure, strict=True) if p is not None]
+        far = iter(distances_among(places) if places else [])
+        parts = [seen]
+        for table, (_, place, _) in zip(things, structure, strict=True):
+            first, shared, bias, second, second_bias = (next(weights) for _ in range(5))
+            described = (table if place is None else torch.cat([table, next(far)], -1)).squeeze(0)
+            hidden = act(_each(described, first) + torch.addmm(bias, seen, shared).unsqueeze(1))
+            embedded = act(_each(hidden, second) + second_bias)
+            parts += [embedded.mean(1), embedded.amax(1)]
+        return torch.cat([*parts, x[:, inputs:]], 1)
+
+    return Layer(
+        "sets",
+        flops=sum(2 * w.size for w in own) + of_things + sum(2 * each.arrays[1].size for each in sets),
+        c=_c(sets, bool(own), kept, inputs, beside, near, kind),
+        onnx=_onnx(sets, bool(own), kept, inputs, near, kind.capitalize()),
+        torch=pooled,
+        arrays=(*own, *(array for each in sets for array in each.arrays)),
+        numbers=(
+            ("sets", structure),
+            ("kept", list(kept)),
+            ("inputs", inputs),
+            ("near", near),
+            ("activation", kind),
+            ("embeds_own", bool(own)),
+        ),
+        width=max(inputs + beside, outputs),
+        scratch=len(kept) + 3 * features + widest + sum(near * each.width for each in sets if each.place is not None),
+    )
+
+
+def _each(things: Tensor, weight: Tensor) -> Tensor:
+    """Return things [rows, K, W] times a weight, in a form that an archive takes for any K."""
+    return torch.bmm(things, weight.expand(things.shape[0], -1, -1))
+
+
+def _c(
+    sets: Sequence[SetOf], embeds_own: bool, kept: Sequence[int], inputs: int, beside: int, near: int, kind: str
+) -> str:
+    """Return the C of a row, in which `set_NAME` has `num_NAME` things: each is described, embedded and pooled."""
+    features, (num_own, _) = sets[0].arrays[3].shape[0], sets[0].arrays[1].shape
+    located = [(k, each) for k, each in enumerate(sets) if each.place is not None]
+    nearest = located if near else []
+    lines = [
+        "static const float origin[2] = {0.0f, 0.0f};",
+        f"static float own[{len(kept)}], thing[{max(len(each.arrays[0]) for each in sets)}];",
+        f"static float shared[{features}], first[{features}], second[{features}];",
+        *(f"static float near{k}[{near * each.width}];" for k, each in nearest),
+        "float none = 0.0f;",
+    ]
+    for k, name in enumerate(named([each.name for each in sets])):
+        lines += [f"const float *things{k} = set_{name};", f"int count{k} = num_{name};"]
+    for k, each in nearest:
+        reader = "origin" if each.reader is None else f"x + {each.reader}"
+        chosen = f"nearest_things(things{k}, count{k}, {each.width}, {each.place}, {reader}, {near}, near{k})"
+        lines += [f"count{k} = {chosen};", f"things{k} = near{k};"]
+    for k, each in located:
+        lines.append(f"none = farthest(things{k} + {each.place}, count{k}, {each.width}, origin, none);")
+    lines += [f"own[{k}] = x[{column}];" for k, column in enumerate(kept)]
+    if embeds_own:
+        lines += [f"affine(w0, w1, {len(kept)}, {num_own}, own, y);", f"apply_{kind}(y, {num_own});"]
+    else:
+        lines.append("memcpy(y, own, sizeof(own));")
+    array, column = 2 * embeds_own, num_own
+    for k, each in enumerate(sets):
+        w = [f"w{array + i}" for i in range(5)]
+        far = []
+        if each.place is not None:
+            far.append(f"thing[{each.width}] = sqrtf(apart(at + {each.place}, origin));")
+            for column_of, (j, other) in enumerate(located, each.width + 1):
+                given = f"at + {each.place}, things{j} + {other.place}, count{j}, {other.width}, 4.0f * none"
+                far.append(f"thing[{column_of}] = sqrtf(nearest({given}));")
+        lines += [
+            f"affine({w[1]}, {w[2]}, {num_own}, {features}, y, shared);",
+            f"for (i = 0; i < count{k}; i++) {{",
+            f"const float *at = things{k} + i * {each.width};",
+            f"memcpy(thing, at, sizeof(float) * {each.width});",
+            *far,
+            f"affine({w[0]}, shared, {len(each.arrays[0])}, {features}, thing, first);",
+            f"apply_{kind}(first, {features});",
+            f"affine({w[3]}, {w[4]}, {features}, {features}, first, second);",
+            f"apply_{kind}(second, {features});",
+            f"pool({features}, i, count{k}, second, y + {column});",
+            "}",
+        ]
+        array, column = array + 5, column + 2 * features
+    lines += [f"memcpy(y + {column}, x + {inputs}, sizeof(float) * {beside});"] if beside else []
+    return "\n".join(["{", *lines, "}", "SWAP;"])
+
+
+def _onnx(sets: Sequence[SetOf], embeds_own: bool, kept: Sequence[int], inputs: int, near: int, act: str) -> str:
+    """Return the ONNX of rows, in which `set_NAME` is a table [rows, things, W]."""
+    lines = [f"picked = Gather<axis = 1>(x, {_list(kept)})", f"rest = Slice(x, [{inputs}], [1000000], [1])"]
+    lines += ["summed = Gemm(picked, w0, w1)", f"own = {act}(summed)"] if embeds_own else ["own = Identity(picked)"]
+    located = [k for k, each in enumerate(sets) if each.place is not None]
+    tables = [f"set_{name}" for name in named([each.name for each in sets])]
+    for k in located:
+        lines += _placed(k, tables[k], sets[k], near)
+        tables[k] = f"near{k}" if near else tables[k]
+    if located:
+        farthest = ", ".join(f"far{k}" for k in located)
+        lines += [f"farthest = Max({farthest})", "none = Mul(farthest, 4.0)"]
+    array, pooled = 2 * embeds_own, list[str]()
+    for k, each in enumerate(sets):
+        w = [f"w{array + i}" for i in range(5)]
+        columns = [tables[k]]
+        if each.place is not None:
+            columns.append(f"distance{k}")
+            for j in located:
+                lines += _nearest(k, j)
+                columns.append(f"gap{k}_{j}")
+        lines += [
+            f"described{k} = Concat<axis = 2>({', '.join(columns)})",
+            f"product{k} = MatMul(described{k}, {w[0]})",
+            f"of_row{k} = Gemm(own, {w[1]}, {w[2]})",
+            f"shared{k} = Unsqueeze(of_row{k}, [1])",
+            f"sum{k} = Add(product{k}, shared{k})",
+            f"first{k} = {act}(sum{k})",
+            f"second{k} = MatMul(first{k}, {w[3]})",
+            f"biased{k} = Add(second{k}, {w[4]})",
+            f"embedded{k} = {act}(biased{k})",
+            f"mean{k} = ReduceMean<axes = [1], keepdims = 0>(embedded{k})",
+            f"maximum{k} = ReduceMax<axes = [1], keepdims = 0>(embedded{k})",
+        ]
+        array, pooled = array + 5, [*pooled, f"mean{k}", f"maximum{k}"]
+    return "\n".join([*lines, f"y = Concat<axis = 1>(own, {', '.join(pooled)}, rest)"])
+
+
+def _placed(k: int, table: str, each: SetOf, near: int) -> list[str]:
+    """Return the ONNX of a set's places and their distances, of the nearest things where `near` says so."""
+    lines, picked = [], f"[{each.place}], [{(each.place or 0) + 2}], [2]"
+    if near:
+        lines = [f"at{k} = Slice({table}, {picked})", f"way{k} = Identity(at{k})"]
+        if each.reader is not None:
+            lines = [lines[0], f"reader{k} = Slice(x, [{each.reader}], [{each.reader + 2}], [1])"]
+            lines += [f"here{k} = Unsqueeze(reader{k}, [1])", f"way{k} = Sub(at{k}, here{k})"]
+        lines += [
+            f"ways{k} = Mul(way{k}, way{k})",
+            f"length{k} = ReduceSum<keepdims = 0>(ways{k}, [2])",
+            f"count{k} = Shape<start = 1, end = 2>(length{k})",
+            f"most{k} = Min(count{k}, [{near}])",
+            f"shortest{k}, which{k} = TopK<axis = 1, largest = 0>(length{k}, most{k})",
+            f"index{k} = Unsqueeze(which{k}, [2])",
+            f"near{k} = GatherND<batch_dims = 1>({table}, index{k})",
+        ]
+        table = f"near{k}"
+    lines += [f"place{k} = Slice({table}, {picked})", f"pp{k} = Mul(place{k}, place{k})"]
+    lines += [f"square{k} = ReduceSum(pp{k}, [2])", f"distance{k} = Sqrt(square{k})"]
+    return [*lines, f"far{k} = ReduceMax<axes = [1], keepdims = 1>(square{k})"]
+
+
+def _nearest(k: int, j: int) -> list[str]:
+    """Return the ONNX of the distances between the things of set k and the nearest other of set j."""
+    name = f"{k}_{j}"
+    lines = [f"a{name} = Unsqueeze(place{k}, [2])", f"b{name} = Unsqueeze(place{j}, [1])"]
+    lines += [f"d{name} = Sub(a{name}, b{name})", f"dd{name} = Mul(d{name}, d{name})"]
+    lines += [f"apart{name} = ReduceSum<keepdims = 0>(dd{name}, [3])"]
+    others = f"apart{name}"
+    if k == j:
+        lines += [f"size{name} = Shape<start = 1, end = 3>(apart{name})", f"zeros{name} = ConstantOfShape(size{name})"]
+        lines += [f"ones{name} = EyeLike<k = 0>(zeros{name})", f"eye{name} = Cast<to = 9>(ones{name})"]
+        lines += [f"other{name} = Where(eye{name}, Infinity, apart{name})"]
+        others = f"other{name}"
+    lines += [f"least{name} = ReduceMin<axes = [2], keepdims = 1>({others})", f"alone{name} = IsInf(least{name})"]
+    return [*lines, f"found{name} = Where(alone{name}, none, least{name})", f"gap{name} = Sqrt(found{name})"]
+
+
+def _list(numbers: Sequence[int]) -> str:
+    return json.dumps(list(numbers), separators=(",", ":"))
