@@ -93,7 +93,7 @@ def act(spaces: Spaces, transform: Transform, action: Tensor, lead: torch.Size) 
         return transform.push_outputs(action)
     if action.shape not in (axes, (*axes, 1)):
         raise UserError(f"the action has shape {shape}, but {list(axes)} is needed, or one-hot with {space.count}")
-    if action.is_floating_point() or action.dtype == torch.bool:
+    if action.is_floating_point() or action.is_complex() or action.dtype == torch.bool:
         raise UserError(f"the action is {action.dtype}, but indices of {space.count} actions are integers")
     low, high = torch.aminmax(action) if action.numel() else (0, 0)
     if low < 0 or high >= space.count:

@@ -8,10 +8,13 @@ import pytest
 
 from esp_cli.bodies import emitting, reading
 from esp_cli.files import writing
+from esp_cli.loop import shapes
+from esp_cli.symmetry import Transform
 from esp_cli.training import trainer
 from tests.bodies.models import biped
 from tests.forks import fork, wait
 from tests.torture.files import KINDS, Files
+from tests.torture.hosts import Hosts
 from tests.torture.kills import Kills
 from tests.torture.lines import Lines
 from tests.torture.models import Models
@@ -66,6 +69,20 @@ def test_a_file_outside_that_is_opened_is_found(models, monkeypatch):
     assert models._try(path, random.Random(1)) is None
     monkeypatch.setattr(reading, "_files", lambda main, name, folders, allowed: [])
     assert "outside was opened" in models._try(path, random.Random(1))
+
+
+def test_data_of_foreign_loops_has_the_right_copies_or_one_sentence(tmp_path, monkeypatch):
+    hosts = Hosts(tmp_path, 1)
+    assert [hosts.run(number) for number in range(3)] == [None] * 3
+    monkeypatch.setattr(shapes, "_check_tensor", lambda name, x: None)
+    assert any(hosts.run(number) for number in range(3))
+
+
+@pytest.mark.parametrize(("move", "wrong"), [("obs", 0.0), ("state", 0.0), ("obs", 1.0), ("state", 1.0)])
+def test_data_that_is_copied_wrongly_is_found(tmp_path, monkeypatch, move, wrong):
+    monkeypatch.setattr(Transform, move, lambda self, x: x + wrong)
+    hosts = Hosts(tmp_path, 1)
+    assert any(hosts.run(number) for number in range(3))
 
 
 @pytest.fixture(scope="module")
