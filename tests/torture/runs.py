@@ -57,6 +57,8 @@ def _choices() -> Iterator[Choice]:
     for algorithm, network in itertools.product(("mappo", "maddpg", "qmix"), ("set", "set-equivariant")):
         yield algorithm, network, "navigation", {}
         yield algorithm, network, "navigation", {"num_agents": 20, "sees": 3, "density": 8.0}
+    for algorithm, network in learners:
+        yield algorithm, network, "predator-prey", {"control": "both"}
     for network in ("mpn", "empn", "equivariant"):
         yield "mappo", network, "navigation", {}
     if find_spec("gymnasium"):
