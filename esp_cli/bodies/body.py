@@ -23,6 +23,8 @@ from esp_cli.symmetry.plane import PlaneElement
 from esp_envs.errors import UserError
 from esp_envs.spec import Field, Kind
 
+SECONDS = 50.0
+"""Processor time within which the search of a model ends."""
 _TURNS = sorted({Fraction(k, n) for n in (2, 3, 4, 5, 6, 8) for k in range(1, n)})
 _AXES = sorted({Fraction(k, n) for n in (10, 16, 24) for k in range(n)})
 TRIED = tuple(
@@ -96,36 +98,48 @@ class Body:
         self.elements = tuple(positions.moves)
 
     @classmethod
-    def from_mjcf(cls, model: Path | str | Any, root: Path | str | None = None, tolerated: float = NEARLY) -> Body:
+    def from_mjcf(
+        cls,
+        model: Path | str | Any,
+        root: Path | str | None = None,
+        tolerated: float = NEARLY,
+        seconds: float = SECONDS,
+    ) -> Body:
         """Find and prove the symmetries of a model.
 
         Args:
             model: an MJCF or URDF file, or a `mujoco.MjModel`.
             root: the folder that holds all its files; by default that of the file.
             tolerated: the largest share by which accelerations of a joint may be off.
+            seconds: of processor time, after which elements that are left are refused as not covered.
 
         Raises:
             UserError: the file cannot be read, or nothing of the model moves.
         """
-        return cls._from_model(read_model(model, root) if isinstance(model, str | Path) else model, tolerated)
+        return cls._from_model(read_model(model, root) if isinstance(model, str | Path) else model, tolerated, seconds)
 
     @classmethod
     def from_urdf(
-        cls, path: Path | str, root: Path | str | None = None, tolerated: float = NEARLY, floating: bool = True
+        cls,
+        path: Path | str,
+        root: Path | str | None = None,
+        tolerated: float = NEARLY,
+        floating: bool = True,
+        seconds: float = SECONDS,
     ) -> Body:
         """Find and prove the symmetries of a URDF file; its first link moves freely unless `floating` is false."""
-        return cls._from_model(read_model(path, root, floating), tolerated)
+        return cls._from_model(read_model(path, root, floating), tolerated, seconds)
 
     @classmethod
     @quiet()
-    def _from_model(cls, model: Any, tolerated: float) -> Body:
+    def _from_model(cls, model: Any, tolerated: float, seconds: float) -> Body:
         if not 0 < model.nv <= MOST_MOVING or model.nu > MOST_MOVING or model.nbody > MOST_BODIES:
             raise UserError(
                 f"the model has {model.nv} degrees of freedom, {model.nu} actuators and {model.nbody} bodies; give one "
                 f"robot, with 1 to {MOST_MOVING} degrees of freedom and at most {MOST_MOVING} actuators and "
                 f"{MOST_BODIES} bodies"
             )
-        self, frame = cls([], {}), Frame(model)
+        self, frame = cls([], {}), Frame(model, seconds)
         idle: set[PlaneElement] = set()  # a mirror in the plane of a planar robot
         found: dict[PlaneElement, Found] = {}
         for element in TRIED:
@@ -158,15 +172,16 @@ class Body:
     ) -> None:
         """Derive and prove one element, and keep it or the reason against it."""
         try:
+            frame.stop_if_late()
             match = derive(frame, element)
+            if match.is_trivial:
+                idle.add(element)
+                return
+            proof = prove(frame, match)
         except UserError as error:
-            if element in TRIED[:2]:
+            if element in TRIED[:2] or frame.is_late:
                 self.refused[element.name] = str(error)
             return
-        if match.is_trivial:
-            idle.add(element)
-            return
-        proof = prove(frame, match)
         if match.unmatched:
             self.refused[element.name] = f"no image was found of the actuators {', '.join(match.unmatched)}"
         elif not proof.gap <= tolerated:  # nor NaN

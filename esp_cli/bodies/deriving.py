@@ -63,7 +63,8 @@ def derive(frame: Frame, element: PlaneElement) -> Match:
     """Find what an element does to a model.
 
     Raises:
-        UserError: the model at rest is far from being its own image; it names a joint or body without an image.
+        UserError: the model at rest is far from being its own image; it names a joint or body without an image. Or the
+            time is over.
     """
     R = frame.image(element)
     com = frame.com[frame.moving]
@@ -91,6 +92,7 @@ def _matched(frame: Frame, R: Floats) -> tuple[dict[int, int], dict[int, int]]:
     @cache
     def cost(b: int, c: int) -> tuple[float, tuple[tuple[int, int], ...], tuple[tuple[int, int], ...]]:
         """Return how badly c is the image of b with all that hangs on them, and the pairs of joints and bodies."""
+        frame.stop_if_late()
         off = float(np.linalg.norm(R @ frame.com[b] - frame.com[c])) / frame.size if frame.mass[b] else 0.0
         if off > FAR:
             return _APART, (), ()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from functools import cached_property
 from typing import Any
 
@@ -11,6 +13,7 @@ import numpy as np
 from esp_cli.bodies.kinds import space
 from esp_cli.symmetry.elements import Floats
 from esp_cli.symmetry.plane import PlaneElement
+from esp_envs.errors import UserError
 
 FREE, BALL, SLIDE, HINGE = range(4)
 """MuJoCo's types of joints."""
@@ -21,8 +24,11 @@ QPOS_WIDTH, DOF_WIDTH = (7, 4, 1, 1), (6, 3, 1, 1)
 class Frame:
     """A model at rest: where its joints and masses are, all seen from the middle of its base.
 
-    Attributes:
+    Args:
         model: the `mujoco.MjModel`.
+        seconds: of processor time that looking for its symmetries may take.
+
+    Attributes:
         base: its first free joint, or None.
         centre: [3], what mirrors and turns leave where it is; z is 0.
         axes: [3, 3] the base's own, in columns: elements are told by them.
@@ -30,8 +36,9 @@ class Frame:
         inertia: [bodies, 3, 3] of each body, along the world's axes.
     """
 
-    def __init__(self, model: Any) -> None:
+    def __init__(self, model: Any, seconds: float = math.inf) -> None:
         self.model, data = model, mujoco.MjData(model)
+        self._seconds, self._until = seconds, time.thread_time() + seconds
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         free = [j for j in range(model.njnt) if model.jnt_type[j] == FREE]
@@ -50,6 +57,16 @@ class Frame:
         self.mass, self.com = self._rigid_parts(data.xipos - self.centre)
         spread = np.concatenate([self.anchor, self.com[self.moving]])
         self.size = max(float(np.linalg.norm(spread - spread.mean(0), axis=1).max()), 1e-6)
+
+    @property
+    def is_late(self) -> bool:
+        """Whether the time is over."""
+        return time.thread_time() > self._until
+
+    def stop_if_late(self) -> None:
+        """Raise a `UserError` once the time is over."""
+        if self.is_late:
+            raise UserError(f"not covered: the {self._seconds:g} s for the search were over")
 
     def image(self, element: PlaneElement) -> Floats:
         """Return the matrix [3, 3] of an element on the world at rest."""

@@ -77,13 +77,17 @@ class Proof:
 
 
 def prove(frame: Frame, match: Match, seed: int = 0) -> Proof:
-    """Compare accelerations of states and of their images, and of planted mistakes."""
+    """Compare accelerations of states and of their images, and of planted mistakes.
+
+    Raises:
+        UserError: the time of the frame is over.
+    """
     rng, data = np.random.default_rng(seed), mujoco.MjData(frame.model)
     samples = [_state(frame, data, rng) for _ in range(_STATES)]
-    here = _accelerations(data, samples, _NO_CONSTRAINTS)
+    here = _accelerations(frame, data, samples, _NO_CONSTRAINTS)
 
     def compared(tried: Match, count: int) -> tuple[Floats, float]:
-        there = _accelerations(data, _images(tried, samples[:count]), _NO_CONSTRAINTS)
+        there = _accelerations(frame, data, _images(tried, samples[:count]), _NO_CONSTRAINTS)
         return _gaps(frame, tried, here[:count], there)
 
     joints, median = compared(match, _STATES)
@@ -94,7 +98,12 @@ def prove(frame: Frame, match: Match, seed: int = 0) -> Proof:
     lowered = [_lowered(frame, data, sample) for sample in samples[:_LYING]]
     lying = [sample for sample in lowered if sample is not None]
     medians = [
-        _gaps(frame, match, _accelerations(data, some, flag), _accelerations(data, _images(match, some), flag))[1]
+        _gaps(
+            frame,
+            match,
+            _accelerations(frame, data, some, flag),
+            _accelerations(frame, data, _images(match, some), flag),
+        )[1]
         for some, flag in ((samples, _NO_CONTACTS), (lying, 0))
         if some
     ]
@@ -103,6 +112,7 @@ def prove(frame: Frame, match: Match, seed: int = 0) -> Proof:
 
 def _state(frame: Frame, data: Any, rng: np.random.Generator) -> Sample:
     """Draw a state: joints within their limits, the base turned about any axis, controls within theirs."""
+    frame.stop_if_late()
     model = frame.model
     qpos = model.qpos0.copy()
     for j, kind in enumerate(model.jnt_type):
@@ -132,18 +142,20 @@ def _images(match: Match, samples: Sequence[Sample]) -> list[Sample]:
     ]
 
 
-def _accelerations(data: Any, samples: Sequence[Sample], disabled: int) -> Floats:
+def _accelerations(frame: Frame, data: Any, samples: Sequence[Sample], disabled: int) -> Floats:
     """Return qacc [states, nv] without what the flags disable."""
-    model = data.model
-    before = model.opt.disableflags
-    model.opt.disableflags = before | disabled
+    before = frame.model.opt.disableflags
+    frame.model.opt.disableflags = before | disabled
     found = []
-    for sample in samples:
-        data.qpos[:], data.qvel[:], data.ctrl[:], data.qfrc_applied[:] = sample
-        data.qacc_warmstart[:] = 0
-        mujoco.mj_forward(model, data)
-        found.append(data.qacc.copy())
-    model.opt.disableflags = before
+    try:
+        for sample in samples:
+            frame.stop_if_late()
+            data.qpos[:], data.qvel[:], data.ctrl[:], data.qfrc_applied[:] = sample
+            data.qacc_warmstart[:] = 0
+            mujoco.mj_forward(frame.model, data)
+            found.append(data.qacc.copy())
+    finally:
+        frame.model.opt.disableflags = before
     return np.stack(found)
 
 
@@ -179,6 +191,7 @@ def _lowered(frame: Frame, data: Any, sample: Sample) -> Sample | None:
     height = frame.qpos_of(frame.base).start + 2
 
     def touches(place: float) -> int:
+        frame.stop_if_late()
         data.qpos[:] = sample[0]
         data.qpos[height] = place
         mujoco.mj_fwdPosition(data.model, data)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from esp_cli import console
-from esp_cli.commands.options import ForceOption, JsonOption
+from esp_cli.commands.options import ForceOption, JsonOption, SecondsOption
 from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
@@ -56,6 +56,7 @@ def mirror(
     rows: Annotated[
         Path | None, typer.Option("--rows", help="Observations that it meets, for --policy.", metavar="FILE.npy")
     ] = None,
+    seconds: SecondsOption = 50.0,
     force: ForceOption = False,
     json: JsonOption = None,
 ) -> None:
@@ -75,7 +76,7 @@ def mirror(
         raise UserError(f"{taken[0]} exists; choose another path, or add --force")
     if rows is not None and policy is None:
         raise UserError("--rows are observations for --policy; name the policy too")
-    body = Body.from_mjcf(model, root)
+    body = Body.from_mjcf(model, root, seconds=seconds)
     if emit is not None and out is not None:
         _write(body, model, numbers, emit, out)
     audited = [] if check is None else _audited(check, body, numbers)
@@ -182,7 +183,7 @@ def _print(body: Body, model: Path) -> None:
         if unseen := [joint for joint, _, _, _, planted, _ in body.rows(name) if not one.proof.would_show(planted)]:
             console.say(f"  not covered: a mistake at {', '.join(unseen)} would not show in accelerations")
     for name, reason in body.refused.items():
-        console.say(f"{called[name]} does not hold: {reason}")
+        console.say(f"{called[name]} " + ("is " if reason.startswith("not covered") else "does not hold: ") + reason)
     if not body.found:
         return
     shown = list(body.found)[:_SHOWN]

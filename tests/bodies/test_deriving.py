@@ -206,3 +206,9 @@ def test_unnamed_joints_are_numbered_and_accelerations_that_are_no_numbers_prove
 def test_models_without_a_joint_are_refused():
     with pytest.raises(UserError, match="0 degrees of freedom"):
         body_of("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+
+
+def test_a_search_ends_in_time_and_says_what_it_did_not_reach() -> None:
+    body = Body.from_mjcf(mujoco.MjModel.from_xml_string(biped()), seconds=0)
+    assert not body.found
+    assert set(body.refused.values()) == {"not covered: the 0 s for the search were over"}
