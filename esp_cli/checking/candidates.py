@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 
@@ -113,20 +114,21 @@ def _listed(text: str, num_agents: int) -> tuple[Element, ...]:
 
 
 def _elements(text: str, num_agents: int) -> tuple[Element, ...]:
-    """Return those to try: all, or of many each one that is no product of those before it."""
+    """Return those to try: all, or of many each one that is no product of those before it that act on the same."""
     elements = _listed(text, num_agents)
     if len(elements) <= _MOST:
         return elements
     chosen: list[Element] = []
-    generating: list[Element] = []
+    generating = dict[frozenset[Any], list[Element]]()  # by what they act on
     reached: set[Element] = set()
     for element in elements:
-        if element in reached:
+        if element in reached or all(element.restricted(frozenset([aspect])) in reached for aspect in element.aspects):
             continue
         chosen.append(element)
+        alike = generating.setdefault(element.aspects, [])
         try:
-            reached.update(FiniteGroup.generated_by(element.name, [*generating, element]).elements)
+            reached.update(FiniteGroup.generated_by(element.name, [*alike, element]).elements)
         except ValueError:  # its products are too many to list, so it stands for itself
             continue
-        generating.append(element)
+        alike.append(element)
     return tuple(chosen)

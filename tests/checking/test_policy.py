@@ -65,6 +65,8 @@ def test_many_elements_are_tried_by_those_that_generate_them() -> None:
     assert len(tried) < 10
     assert set(parse_elements("d4*agents", 5)) < set(FiniteGroup.generated_by("tried", tried).elements)
     assert [len(candidates(spec, text)) for text in ("d4", "d4*agents-1-0-2-3-4")] == [7, 8]
+    of_six = candidates(worlds(num_agents=6)(2, [0]).spec, "d4,agents")
+    assert len(of_six) < 10, "though d4 and all orders of six generate more than can be listed"
 
 
 def test_a_weak_agent_breaks_the_orders_of_five_agents() -> None:
