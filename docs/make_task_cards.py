@@ -1,18 +1,29 @@
-"""Write what `esp tasks` says of the built-in tasks to a file beside the command: python docs/make_task_cards.py."""
+"""Write what `esp tasks` says of built-in tasks and robots to a file beside it: python docs/make_task_cards.py."""
 
 from __future__ import annotations
 
 import json
 
 from esp_cli.commands.tasks import CARDS, describe
+from esp_envs.errors import UserError
+from esp_envs.installed import FURTHER
 from esp_envs.registry import TASKS
 
-BUILT_IN = tuple(name for name in TASKS if TASKS.ships(name))
+NAMES = (*(name for name in TASKS if TASKS.ships(name)), *FURTHER["esp.tasks"])
 
 
 def text() -> str:
     """Return the content of the file."""
-    return json.dumps({name: describe(name) for name in BUILT_IN}, indent=1) + "\n"
+    before = json.loads(CARDS.read_text(encoding="utf-8"))
+    return json.dumps({name: _card(name, before) for name in NAMES}, indent=1) + "\n"
+
+
+def _card(name: str, before: dict[str, object]) -> object:
+    """Describe a task; one whose package is missing stays as it was."""
+    try:
+        return describe(name)
+    except UserError:
+        return before[name]
 
 
 if __name__ == "__main__":

@@ -3,6 +3,8 @@
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from esp_envs.installed import FURTHER
+
 if TYPE_CHECKING:
     from esp_cli.bodies import Body
     from esp_cli.checking import Transitions
@@ -42,6 +44,8 @@ _HOMES = dict.fromkeys(__all__, "esp_envs.spec") | {
     "train": "esp_cli.run",
 }
 __dir__ = __all__.copy
+_ROBOTS = ("Ant", "HalfCheetah", "Walker2d", "Humanoid", "Swimmer", "Ant4x2", "HalfCheetah2x3")
+FURTHER["esp.tasks"] = {name.lower(): f"esp_cli.bodies.gymnasium:{name}" for name in _ROBOTS}
 
 
 def __getattr__(name: str) -> Any:

@@ -22,6 +22,8 @@ from typing import Any, TypeVar
 from esp_envs.errors import UserError
 
 T = TypeVar("T")
+FURTHER: dict[str, dict[str, str]] = {}
+"""Classes "module:Class" by name, of each group of entry points, that a package adds when it is imported."""
 _FOREIGN: set[str] = set()  # top-level modules of the classes that are registered or installed
 
 _ELSEWHERE = {"simple_spread": "navigation", "simple_tag": "predator-prey"}  # names of tasks in MPE
@@ -102,7 +104,7 @@ class Registry(Mapping[str, type[T]]):
         return sum(1 for _ in self)
 
     def _installed(self) -> dict[str, EntryPoint]:
-        return {entry.name: entry for entry in entry_points(group=self.group)}
+        return {entry.name: entry for entry in entries(self.group)}
 
     def _import(self, name: str) -> type[T]:
         if not _MODULE_AND_CLASS.fullmatch(name):
@@ -137,6 +139,12 @@ class Registry(Mapping[str, type[T]]):
             missing = ", ".join(sorted(vars(cls)["__abstractmethods__"]))
             raise UserError(f"the {self.noun} '{name}' lacks {missing}; implement what its base class leaves open")
         return cls
+
+
+def entries(group: str) -> list[EntryPoint]:
+    """Return what packages install, and those that are `FURTHER`; none is imported."""
+    added = FURTHER.get(group, {}).items()
+    return [*(EntryPoint(name, target, group) for name, target in added), *entry_points(group=group)]
 
 
 def raised_in(failure: BaseException) -> str | None:

@@ -21,7 +21,7 @@ from esp_cli.symmetry.elements import Floats
 from esp_cli.symmetry.parse import parse_elements
 from esp_cli.symmetry.plane import PlaneElement
 from esp_envs.errors import UserError
-from esp_envs.spec import Field, Kind
+from esp_envs.spec import Field, Kind, Layout
 
 SECONDS = 50.0
 """Processor time within which the search of a model ends."""
@@ -88,6 +88,7 @@ class Body:
         pairs += [pair for table in (limbs or {}).values() if not isinstance(table, str) for pair in table.items()]
         ends = list(dict.fromkeys(name for pair in pairs for name in pair))
         self._numbers: dict[str, int] = {}
+        self._base: tuple[Parts, Parts] | None = None
         self.found: dict[str, Found] = {}
         self.refused: dict[str, str] = {}
         self._set(named, named, named, named_parts("limbs", ends, limbs or {}))
@@ -160,6 +161,12 @@ class Body:
             Parts("limbs", limbs, {g: m.bodies for g, m in matches.items()}),
         )
         self._numbers = names
+        if frame.base is not None:
+            q, v = frame.qpos_of(frame.base).start, frame.dofs_of(frame.base).start
+            places = {"place": slice(q, q + 3), "attitude": slice(q + 3, q + 7)}
+            rates = {"velocity": slice(v, v + 3), "spin": slice(v + 3, v + 6)}
+            moves = self._positions.moves, self._velocities.moves
+            self._base = Parts("base's", places, moves[0]), Parts("base's", rates, moves[1])
         return self
 
     def _try(
@@ -272,6 +279,25 @@ class Body:
     def command(history: int = 1, name: str = "command") -> Field:
         """Return the field of a commanded (vx, vy, turning rate)."""
         return Field(name, kinds.PLANAR_COMMAND, history)
+
+    def state(self) -> Layout:
+        """Return the layout of MuJoCo's qpos and qvel: `simulated` of a task, whose states checks can pair.
+
+        Raises:
+            UserError: the body is not that of a model, or its free joint is not the first.
+        """
+        if not self._numbers and self._base is None:
+            raise UserError("a body that is given by names has no state; make it of a model")
+        fields = []
+        for k, joints in enumerate((self._positions, self._velocities)):
+            if self._base is not None:
+                base = self._base[k]
+                if min(span.start for span in base.places.values()):
+                    raise UserError("the free joint is not the first of the model, so its state has no layout")
+                fields += [base.field(name, [name], 1) for name in base.places]
+            if self.joints:
+                fields.append(joints.field(("positions", "velocities")[k], self.joints, 1))
+        return Layout(tuple(fields))
 
     def check_pose(self, pose: Mapping[str, float], tolerance: float = 1e-3) -> None:
         """Refuse a pose that is not its own image: positions relative to it would not transform as `positions`.

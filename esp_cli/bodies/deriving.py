@@ -214,7 +214,7 @@ def _all_bodies(frame: Frame, R: Floats, moved: dict[int, int]) -> Floats:
             continue
         carrier = moved[frame.carrier(b)]
         like = [c for c in range(1, count) if c not in moved and frame.carrier(c) == carrier]
-        gaps = [float(np.linalg.norm(R @ frame.place[b] - frame.place[c])) / frame.size for c in like]
+        gaps = [float(np.abs(frame.places[b] @ R.T - frame.places[c]).max()) / frame.size for c in like]
         if gaps and min(gaps) < LOOSE:
             where[like[int(np.argmin(gaps))], b] = 1
     return where

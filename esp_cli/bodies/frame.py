@@ -33,6 +33,7 @@ class Frame:
         centre: [3], what mirrors and turns leave where it is; z is 0.
         axes: [3, 3] the base's own, in columns: elements are told by them.
         size: largest distance of a joint or mass from their middle, m.
+        places: [bodies, 2, 3] origin and middle of mass of each body, without what is fixed to it.
         inertia: [bodies, 3, 3] of each body, along the world's axes.
     """
 
@@ -49,7 +50,7 @@ class Frame:
         self.centre = data.xpos[model.jnt_bodyid[free[0]] if free else roots].reshape(-1, 3).mean(0)
         self.centre[2] = 0
         self.axes = data.xmat[model.jnt_bodyid[free[0]]].reshape(3, 3).copy() if free else np.eye(3)
-        self.place = data.xpos - self.centre
+        self.places = np.stack([data.xpos, data.xipos], 1) - self.centre
         self.anchor, self.axis = data.xanchor - self.centre, data.xaxis.copy()
         self.turned = data.xmat.reshape(-1, 3, 3).copy()
         axes = data.ximat.reshape(-1, 3, 3)

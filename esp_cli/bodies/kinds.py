@@ -40,6 +40,17 @@ ATTITUDE_6D = Kind("attitude of 6", 6)
 """The first two columns of the body's rotation matrix, row after row."""
 PLANAR_COMMAND = Kind("planar command", 3)
 """(vx, vy, turning rate) that a robot is told."""
+TWIST, INERTIA = Kind("twist", 6), Kind("inertia", 10)
+"""MuJoCo's numbers of a body in the world's axes: (turn, shift) of `cvel`, (torque, force) of `cfrc_ext`; `cinert`."""
+
+
+def _inertia(planar: Floats) -> Floats:
+    """Return how (xx, yy, zz, xy, xz, yz), mass times place, and mass transform, [10, 10]."""
+    turn, rows, columns = space(planar), [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
+    unit = np.zeros((6, 3, 3))
+    unit[range(6), rows, columns] = unit[range(6), columns, rows] = 1
+    return block_diag((turn @ unit @ turn.T)[:, rows, columns].T, turn, 1)
+
 
 KIND_MATRICES |= {
     VECTOR_3D: space,
@@ -47,6 +58,8 @@ KIND_MATRICES |= {
     QUATERNION: lambda planar: block_diag(1, axial(planar)),
     QUATERNION_XYZW: lambda planar: block_diag(axial(planar), 1),
     ATTITUDE_6D: lambda planar: np.kron(space(planar), planar).astype(np.float64),
+    TWIST: lambda planar: block_diag(axial(planar), space(planar)),
+    INERTIA: _inertia,
     PLANAR_COMMAND: lambda planar: block_diag(planar, np.linalg.det(planar).round()),
 }
 

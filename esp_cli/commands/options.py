@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterable
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -81,8 +80,10 @@ def was_given(context: typer.Context, name: str | None) -> bool:
 
 
 def installed_tasks() -> list[str]:
-    """Return the names of the tasks that other packages install; none is imported."""
-    return [entry.name for entry in entry_points(group="esp.tasks")]
+    """Return the names of the robots' tasks, and of those that other packages install; none is imported."""
+    from esp_envs.installed import entries
+
+    return [entry.name for entry in entries("esp.tasks")]
 
 
 def register_named(

@@ -103,7 +103,10 @@ class Simulator:
         if callable(getattr(bare, "observe", None)):
             return {agent: bare.observe(agent) for agent in agents}
         get = getattr(bare, "_get_obs", getattr(bare, "_get_ob", None))
-        return dict.fromkeys(agents, get()) if callable(get) else None
+        if not callable(get):
+            return None
+        seen = get()
+        return seen if isinstance(seen, Mapping) and set(agents) <= set(seen) else dict.fromkeys(agents, seen)
 
     def _columns(self) -> list[tuple[str, Sequence[Any], str, Items]]:
         """Return name, entities, attribute and items of each part of the state of particles; none of others."""
