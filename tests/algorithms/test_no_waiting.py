@@ -96,7 +96,9 @@ def meta(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def learner(task: str, algorithm: str, device: str, **others: object) -> Learner:
     settings: dict[str, object] = {"network.hidden": [16, 16], f"{algorithm}.num_envs": 4}
-    if algorithm != "mappo":
+    if algorithm == "mappo":
+        settings |= {"mappo.num_epochs": 2}
+    else:
         settings |= {f"{algorithm}.warmup_episodes": 0, f"{algorithm}.batch_episodes": 4}
     config = resolve_config(task, algorithm, steps=1000, seeds=(0, 1), overrides=settings | others)
     return build_learner(config.model_copy(update={"device": device}))

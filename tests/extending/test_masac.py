@@ -11,11 +11,12 @@ import torch
 
 from esp_cli import load_policy
 from esp_cli.algorithms.presets import ALGORITHMS
-from esp_cli.training.metrics import column, read_metrics
 from esp_envs.fields import Field, Kind, layout
 from esp_envs.spec import Continuous
 from tests.algorithms.off_policy import equal, learner, networks
 from tests.cli.running import esp
+from tests.learning.pointing import Pointing
+from tests.learning.test_off_policy_answers import learn
 
 DOCS = Path(__file__).parents[2] / "docs"
 MASAC = "masac:Masac"
@@ -215,9 +216,10 @@ def test_the_value_consistency_is_0_for_an_invariant_critic_alone(actions):
     assert set(errors) == {"policy_symmetry_error", "value_symmetry_error"}
 
 
-@pytest.mark.slow
-def test_it_learns_navigation(tmp_path):
-    """Random actions return -219."""
-    esp("train", *ALGO, "--steps", "40k", "--set", "evaluation.episodes=64", "--out", tmp_path / "run")
-    returns = column(read_metrics(tmp_path / "run" / "metrics.jsonl"), "eval/return_greedy")[1].ravel()
-    assert returns[-1] > -195
+def test_it_finds_the_answer_and_sooner_with_the_prior():
+    plain = learn(MASAC, Pointing, kind="none")
+    assert plain[0].max() < 0.5
+    assert plain[-1].min() > 0.9
+    esp = learn(MASAC, Pointing, kind="esp", transforms="d4")
+    assert esp[-1].min() > 0.9
+    assert (torch.stack(esp[1:3]).mean(0) > torch.stack(plain[1:3]).mean(0)).all(), "of each seed"

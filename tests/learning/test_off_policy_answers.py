@@ -14,17 +14,17 @@ from tests.learning.pointing import SEEDS, AlwaysRight, Pointing, score
 
 ROUNDS = 40
 LOOK_EVERY = 10
-SETTINGS = {"num_envs": 8, "gamma": 0.0, "learning_rate": 3e-3, "epsilon_steps": 1000, "anneal_learning_rate": False}
+RATES = {"learning_rate": 3e-3, "actor_learning_rate": 3e-3, "anneal_learning_rate": False}
+SETTINGS = {"num_envs": 8, "gamma": 0.0, "epsilon_steps": 1000, **RATES}
 """An iteration is eight episodes of four steps; gamma 0, as the next target does not depend on the action."""
 
 
 def learn(algorithm: str, task: type[Pointing], rounds: int = ROUNDS, **prior: object) -> list[Tensor]:
     """Return the greedy return [S] over the optimum of untrained policies and then every few iterations."""
     cls = ALGORITHMS[algorithm]
-    extra = {"actor_learning_rate": 3e-3} if algorithm == "maddpg" else {}
     learner = cls(
         task(8, stream_seeds(SEEDS, "training worlds")),
-        cls.config_class.model_validate(SETTINGS | extra),
+        cls.config_class(**{name: value for name, value in SETTINGS.items() if name in cls.config_class.model_fields}),
         MlpConfig(hidden=(32,), activation="relu"),
         PriorConfig.model_validate(prior),
         generators(SEEDS, "learner"),
