@@ -303,7 +303,7 @@ def test_a_search_on_a_cluster_goes_on_after_a_stop_and_scores_as_on_this_machin
     from esp_cli.studies.search import Outcome, Search
 
     monkeypatch.setenv("ESP_CHECKPOINT_SECONDS", "0")
-    asked = tuning(priors=("esp",), budget=3, steps=STEPS)
+    asked = tuning(priors=("esp",), budget=3, steps=STEPS // 3)
 
     def searched(path: Path, engine: Engine) -> Outcome:
         """Search; stop at the first checkpoint, and go on."""
