@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 
 import pytest
 import torch
 
 from esp_cli.symmetry import build_transform, environment_errors, parse_elements
-from esp_envs import Environment, Field, Kind, UserError, generators_for, layout, make, register
+from esp_cli.training.build import build_learner
+from esp_cli.training.config import resolve_config
+from esp_envs import Environment, Field, Items, Kind, UserError, generators_for, layout, make, register
 from esp_envs.adapters import seed_of
+from esp_envs.adapters.simulation import groups_of
 from esp_envs.conformance import Subject, check
+from esp_envs.roles import OthersAtRandom, RoleView
 from tests.own_tasks import save_page_files
 
 vmas = pytest.importorskip("vmas", reason="VMAS comes with the extra 'vmas'")
@@ -252,3 +257,39 @@ def test_columns_and_other_types_of_numbers_are_read() -> None:
     )
     assert step.reward.dtype == torch.float32
     assert step.terminated.tolist() == [[False, True, False]]
+
+
+class Tag(VmasTask):
+    """VMAS simple_tag, both of whose sides learn."""
+
+    scenario, symmetry, convention = "simple_tag", "d4*agents", "vmas simple_tag"
+    shared_reward = {"adversary": True}  # noqa: RUF012  (as users write a task)
+
+    def seen(self):
+        own = (Field("velocity", Kind.VECTOR), Field("position", Kind.VECTOR), Field("obstacles", Kind.VECTOR, 2))
+        fellows, hunters = (Field("fellows", Kind.VECTOR, 2, items=Items.OTHERS), Field("hunters", Kind.VECTOR, 3))
+        prey = (Field("prey", Kind.VECTOR, family="agent"), Field("prey_velocity", Kind.VECTOR, family="agent"))
+        return {"adversary": layout(*own, fellows, *prey), "agent": layout(*own, replace(hunters, family="adversary"))}
+
+    def arguments(self):
+        return {}
+
+
+def test_groups_of_agents_are_roles() -> None:
+    env = Tag(Tag.Settings(horizon=6), 5, generators_for((3, 7)))
+    assert [(role.name, role.num_agents, role.observation.width) for role in env.spec.roles] == [
+        ("adversary", 3, 16),
+        ("agent", 1, 14),
+    ]
+    found = check(Subject(lambda n, seeds: Tag(Tag.Settings(horizon=6), n, generators_for(seeds)), rounding=1e-4))
+    assert [finding for finding in found if finding.broken] == []
+    start = env.reset()
+    prey = RoleView(OthersAtRandom(env), "agent")
+    assert torch.equal(prey.set_state(start.state).obs[:, :, 0], start.obs[:, :, 3, :14])
+    assert [f.items for f in prey.spec.state.fields[:4]] == [Items.FIXED] * 2 + [Items.AGENTS] * 2
+    step = env.step(env.random_action())
+    assert bool((step.reward[..., :3] == step.reward[..., :1]).all())
+    config = resolve_config(register(Tag), steps=50, overrides={"mappo.num_envs": 2, "prior.transforms": "d4*agents"})
+    assert bool(build_learner(config).iterate(0.0).finite.all())
+    with pytest.raises(UserError, match="gives the roles agent, adversary for adversary_0"):
+        groups_of(env._sims[0].agents, ["agent", "adversary"])

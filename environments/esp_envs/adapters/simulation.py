@@ -50,6 +50,18 @@ def rows(given: Sequence[Any], what: str, num_envs: int, width: int | None = Non
     return torch.stack([one.reshape(num_envs, -1) for one in given], 1).float()
 
 
+def groups_of(agents: Sequence[Any], roles: Sequence[str]) -> dict[str, slice]:
+    """Return where the agents of each role stand, whose names begin with it; all of them as "" without roles."""
+    if not roles:
+        return {"": slice(0, len(agents))}
+    owner = [max((r for r in roles if a.name.startswith(r)), key=len, default="") for a in agents]
+    ends = {role: (owner.index(role), owner.index(role) + owner.count(role)) for role in roles if role in owner}
+    if [role for role in roles for _ in range(owner.count(role))] != owner:
+        names = ", ".join(agent.name for agent in agents)
+        raise UserError(f"'seen' gives the roles {', '.join(roles)} for {names}; begin names so, in the agents' order")
+    return {role: slice(*where) for role, where in ends.items()}
+
+
 def force_of(agent: Any) -> float:
     """Return the full force of an agent, which has to act by a force in the plane of one range."""
     if agent.action_size != 2 or torch.as_tensor(agent.u_range).numel() != 1 or not agent.silent:
@@ -81,7 +93,8 @@ class RandomNumbers:
 class Entities:
     """The entities of a simulator as the global state."""
 
-    def __init__(self, sim: Any, own_goals: str, flags: Sequence[str]) -> None:
+    def __init__(self, sim: Any, own_goals: str, flags: Sequence[str], groups: Mapping[str, slice]) -> None:
+        """Take the agents by role; the role "" is of a scenario without roles."""
         landmarks = sim.world.landmarks
         goals = [i for i, entity in enumerate(landmarks) if own_goals and entity.name.startswith(own_goals)]
         if goals and len(goals) != len(sim.agents):
@@ -90,8 +103,10 @@ class Entities:
             )
         rest = [i for i in range(len(landmarks)) if i not in goals]
         self._columns: list[tuple[Field, int, list[int], str]] = []
-        self._add("agents", sim, _AGENTS, list(range(len(sim.agents))), Items.AGENTS)
-        self._add("goals", sim, _LANDMARKS, goals, Items.AGENTS)
+        for role, where in groups.items():
+            own = list(range(len(sim.agents)))[where]
+            self._add(role or "agents", sim, _AGENTS, own, Items.FIXED if role else Items.AGENTS, role)
+        self._add("goals", sim, _LANDMARKS, goals, Items.AGENTS if "" in groups else Items.FIXED)
         for i in rest:
             self._add(landmarks[i].name.replace(" ", "_"), sim, _LANDMARKS, [i], Items.FIXED)
         for i, agent in enumerate(_of(sim)[_SCRIPTED]):
@@ -127,7 +142,7 @@ class Entities:
                     flag = getattr(entities[i], what)
                     setattr(entities[i], what, part.view_as(flag).to(flag.dtype))
 
-    def _add(self, name: str, sim: Any, group: int, index: list[int], items: Items) -> None:
+    def _add(self, name: str, sim: Any, group: int, index: list[int], items: Items, family: str = "") -> None:
         if not index:
             return
         first = _of(sim)[group][index[0]]
@@ -138,7 +153,8 @@ class Entities:
             columns.append(("rot", "heading", Kind.VECTOR, "direction"))
             columns.append(("ang_vel", "spin", Kind.PSEUDOSCALAR, "rad/s"))
         for what, word, kind, unit in columns:
-            self._columns.append((Field(f"{name}.{word}", kind, len(index), unit, items), group, index, what))
+            field = Field(f"{name}.{word}", kind, len(index), unit, items, family=family)
+            self._columns.append((field, group, index, what))
 
 
 _STATE = ("pos", "vel", "rot", "ang_vel")  # what an entity's state holds; anything else is a flag of the entity itself

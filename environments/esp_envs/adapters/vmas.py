@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -14,11 +14,12 @@ from pydantic import Field as Setting
 from torch import Tensor
 
 from esp_envs.adapters import require_attributes, seed_of, simulation
-from esp_envs.base import Environment, Observation, Step, require_shape
+from esp_envs.base import Environment, Observation, Step, joined, require_shape
 from esp_envs.errors import UserError
+from esp_envs.roles import Role, of_role, spec_with_roles
 from esp_envs.scene import Body, Scene
 from esp_envs.settings import TaskSettings
-from esp_envs.spec import Continuous, Field, Kind, Layout, TaskSpec, layout
+from esp_envs.spec import Continuous, Field, Kind, Layout, layout
 
 FORCE = Continuous(layout(Field("force", Kind.VECTOR, unit="share of the full force")))
 
@@ -58,16 +59,23 @@ class VmasTask(Environment):
     """Attributes of landmarks, 0 or 1 for each world, that belong to the state."""
     terminates: bool = False
     """Whether the scenario's `done` ends an episode; without it, `done` is a metric."""
-    shared_reward: bool = False
+    shared_reward: bool | Mapping[str, bool] = False
+    """Whether all agents, or those of a role, get the same reward."""
     metrics: tuple[str, ...] = ()
     """Names in the scenario's `info`; their mean over the agents is a metric."""
 
     @abstractmethod
-    def seen(self) -> Layout:
-        """Return the layout of one agent's observation, after `reading`."""
+    def seen(self) -> Layout | Mapping[str, Layout]:
+        """Return the layout of one agent's observation, after `reading`.
+
+        Where agents of several kinds learn, that of each role by its name, with which the names of its agents begin.
+        """
 
     def reading(self, obs: Tensor) -> Tensor:
-        """Turn the scenario's observations [E, N, width] into the numbers of the layout [E, N, D]."""
+        """Turn the scenario's observations [E, N, width] into the numbers of the layout [E, N, D].
+
+        Rows of roles that see less end with zeros.
+        """
         return obs
 
     def arguments(self) -> dict[str, object]:
@@ -81,18 +89,27 @@ class VmasTask(Environment):
         make = simulation.maker(self.scenario, num_envs, self.device, self.arguments())
         self._sims = [make() for _ in self.generators]
         self._numbers = [simulation.RandomNumbers(generator.initial_seed()) for generator in self.generators]
-        self._entities = simulation.Entities(self._sims[0], self.own_goals, self.flags)
-        self.spec = TaskSpec(
+        given = self.seen()
+        seen = given if isinstance(given, Mapping) else {"": given}
+        self._groups = simulation.groups_of(self._sims[0].agents, list(seen) if isinstance(given, Mapping) else [])
+        self._entities = simulation.Entities(self._sims[0], self.own_goals, self.flags, self._groups)
+        self.spec = spec_with_roles(
+            [
+                Role(
+                    name=name,
+                    num_agents=where.stop - where.start,
+                    observation=seen[name],
+                    action=FORCE,
+                    shared_reward=of_role(self.shared_reward, name, False),
+                )
+                for name, where in self._groups.items()
+            ],
             name=f"vmas-{self.scenario}" if isinstance(self.scenario, str) else type(self).__name__.lower(),
             version=1,
             convention=self.convention,
-            num_agents=len(self._sims[0].agents),
             horizon=self.settings.horizon,
-            observation=self.seen(),
             state=self._entities.layout,
-            action=FORCE,
             symmetry=self.symmetry,
-            shared_reward=self.shared_reward,
             terminates=self.terminates,
             totals=("done",) if self.terminates else (),
             settings=settings.model_dump(),
@@ -103,7 +120,7 @@ class VmasTask(Environment):
         self._begun, self._time = torch.zeros(2, *lead, dtype=torch.int64).unbind()  # on the CPU: clocks are asked
         with simulation.RandomNumbers(0).drawn():
             first = self._sims[0].reset()
-        width = self.reading(simulation.rows(first, "observation", num_envs)).shape[-1]
+        width = self.reading(self._rows(first)).shape[-1]
         if width != self.spec.observation.width:
             raise UserError(
                 f"the scenario shows {width} numbers to an agent, but the layout has {self.spec.observation.width}"
@@ -118,7 +135,7 @@ class VmasTask(Environment):
 
     def step(self, action: Tensor) -> Step:
         require_shape("joint action", action, self.action_shape)
-        force = self.spec.action.admissible(action) * self._range.unsqueeze(-1)
+        force = self.spec.admissible(action) * self._range.unsqueeze(-1)
         reached, following, rewards, ends, measured = [], [], [], [], []
         self._time += 1
         due = self._time == self.spec.horizon
@@ -193,8 +210,13 @@ class VmasTask(Environment):
         obs = torch.where(which[None, :, None, None], new.obs, here.obs)
         return Observation(obs, torch.where(which[None, :, None], new.state, here.state))
 
+    def _rows(self, obs: Sequence[Tensor]) -> Tensor:
+        """Return the scenario's observations [E, N, width]."""
+        parts = [simulation.rows(obs[where], "observation", self.num_envs) for where in self._groups.values()]
+        return joined(parts)
+
     def _look(self, sim: Any, obs: Sequence[Tensor]) -> Observation:
-        seen = self.reading(simulation.rows(obs, "observation", self.num_envs))
+        seen = self.reading(self._rows(obs))
         return Observation(seen.unsqueeze(0), self._entities.read(sim).unsqueeze(0))
 
 
