@@ -1,5 +1,7 @@
 """Tasks with agents of several kinds: numbers worked out by hand, learners in step, runs, resuming, evaluation."""
 
+# ruff: noqa: RUF012  (as users write a task)
+
 from __future__ import annotations
 
 import json
@@ -11,7 +13,7 @@ import torch
 from torch import Tensor
 from typer.testing import CliRunner
 
-from esp_cli import load_policy
+from esp_cli import Symmetry, load_policy
 from esp_cli.app import app
 from esp_cli.checking import check_symmetry
 from esp_cli.checking.measured import prepared
@@ -22,9 +24,11 @@ from esp_cli.symmetry import Element, build_transform, transform_set
 from esp_cli.training.build import ScriptedController, build_learner, play
 from esp_cli.training.config import RunConfig, resolve_config
 from esp_envs import Discrete, Field, Items, Kind, UserError, generators_for, joint_layout, layout, make, register
-from esp_envs.conformance import Subject, check
+from esp_envs.adapters.pettingzoo import ParallelTask
+from esp_envs.conformance import QUICK, Subject, check
 from esp_envs.roles import Lockstep, OthersAtRandom, Role, RoleView, spec_with_roles, worlds_of_role
 from tests.envs.chase import STEPS, STEPS_OR_STAY, Chase
+from tests.envs.mpe_roles import MOVES, WORDS, SpeakerListener
 
 TASK = "tests.envs.chase:Chase"
 CALL = CliRunner()
@@ -287,3 +291,45 @@ def test_both_sides_of_predator_prey_see_and_get_what_each_does_alone():
         make("predator-prey", 1, [0], {"control": "both", "prey": "still"})
     config = resolve_config("predator-prey", steps=100, overrides={"task.control": "both", "mappo.num_envs": 4})
     assert bool(build_learner(config).iterate(0.0).finite.all())
+
+
+@pytest.mark.parametrize("name", ["Tag", "SpeakerListener", "Adversary", "WorldComm"])
+def test_tasks_of_mpe2_with_roles_keep_their_promises_and_train(name):
+    pytest.importorskip("mpe2")
+    task = register(f"tests.envs.mpe_roles:{name}")
+    found = check(Subject(lambda num_envs, seeds: make(task, num_envs, seeds, {"horizon": 5, "workers": 0})), QUICK)
+    assert not [finding.broken for finding in found if finding.broken]
+    settings = {"task.horizon": 5, "task.workers": 0, "mappo.num_envs": 4, "mappo.num_steps": 5}
+    config = resolve_config(task, steps=40, overrides=settings)
+    assert config.prior.transforms == "d4"
+    assert bool(build_learner(config).iterate(0.0).finite.all())
+
+
+def test_a_symmetry_for_loops_of_others_takes_a_roles_layouts():
+    role = worlds().spec.roles[0]
+    symmetry = Symmetry(
+        observation=role.observation, action=role.action, state=role.state, num_agents=2, group="agents"
+    )
+    moved = symmetry.augment(torch.tensor([[[0.0, 3, 1], [3, 0, 1]]]), torch.tensor([[0, 1]]), state=torch.eye(3)[:1])
+    assert moved.action.tolist() == [[0, 1], [1, 0]]
+    assert moved.state.tolist() == [[1, 0, 0], [0, 1, 0]]
+
+
+def test_roles_of_names_that_say_nothing_are_listed():
+    class Listed(ParallelTask):  # as users write a task
+        observation = {"one": layout(Field("a", Kind.SCALAR, 3)), "other": layout(Field("b", Kind.SCALAR, 11))}
+        action = {"one": WORDS, "other": MOVES}
+        roles, symmetry, convention = {"one": ["speaker_0"], "other": ["listener_0"]}, "c1", "listed"
+        make_one = SpeakerListener.make_one
+
+    pytest.importorskip("mpe2")
+    make_it = lambda cls: cls(cls.Settings(), 2, generators_for((0,)))  # noqa: E731
+    assert [role.name for role in make_it(Listed).spec.roles] == ["one", "other"]
+    Listed.roles = {}
+    with pytest.raises(
+        UserError, match="no agent's name begins with 'one'; the agents are speaker_0, listener_0; name"
+    ):
+        make_it(Listed)
+    Listed.action = {"one": WORDS}
+    with pytest.raises(UserError, match="is given by role, but not of 'other'; add it"):
+        make_it(Listed)
