@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import Any, ClassVar
 
@@ -17,6 +17,7 @@ from esp_cli.bodies.showing import Layouts, layouts_of
 from esp_cli.symmetry.elements import Element
 from esp_envs.adapters.gymnasium import SingleAgentSettings, SingleAgentTask
 from esp_envs.adapters.pettingzoo import ParallelTask
+from esp_envs.epuck.gl import choose_library
 from esp_envs.errors import UserError
 from esp_envs.installed import install
 from esp_envs.settings import TaskSettings
@@ -72,7 +73,9 @@ class MujocoTask(_OfModel, SingleAgentTask):
 
     def make_single(self) -> Any:
         steps = {"max_episode_steps": self.settings.horizon, "disable_env_checker": True}
-        return _module("gymnasium").make(self.scenario, render_mode="rgb_array", **steps, **self.arguments)
+        env = _module("gymnasium").make(self.scenario, render_mode="rgb_array", **steps, **self.arguments)
+        env.unwrapped.render = _painter(env.unwrapped)
+        return env
 
     def _layouts(self, env: Any) -> Layouts:
         bare = env.unwrapped
@@ -96,8 +99,8 @@ class MujocoTeam(_OfModel):
         env = make(self.scenario, self.parts, max_episode_steps=self.settings.horizon, **self.arguments)
         robot = env.single_agent_env.unwrapped
         # where checks and pictures look for them
-        env.data, env.model, env.set_state, env.render_mode = robot.data, robot.model, robot.set_state, "rgb_array"
-        robot.render_mode = robot.mujoco_renderer.render_mode = "rgb_array"
+        env.data, env.model, env.set_state = robot.data, robot.model, robot.set_state
+        env.render_mode, env.render = "rgb_array", _painter(robot)
         return env
 
     def _layouts(self, env: Any) -> Layouts:
@@ -149,6 +152,20 @@ class HalfCheetah2x3(MujocoTeam):
     """MaMuJoCo's HalfCheetah with an agent for each leg. Its model has no mirror, so nothing holds."""
 
     scenario, parts, convention = "HalfCheetah", "2x3", "mamujoco_v1 HalfCheetah 2x3"
+
+
+def _painter(robot: Any) -> Callable[[], Any]:
+    """Return what draws a robot; Gymnasium's own way needs the variable MUJOCO_GL where there is no display."""
+    opened: list[Any] = []
+
+    def render() -> Any:
+        if not opened:
+            choose_library()
+            opened.append(mujoco.Renderer(robot.model, 480, 480))
+        opened[0].update_scene(robot.data, camera=0 if robot.model.ncam else -1)
+        return opened[0].render()
+
+    return render
 
 
 def _module(package: str) -> Any:

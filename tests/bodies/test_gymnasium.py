@@ -159,3 +159,14 @@ def test_a_missing_package_is_one_sentence(monkeypatch):
     monkeypatch.setattr(robots._OfModel, "_known", {})
     with pytest.raises(UserError, match=r"needs a package that is missing \(gymnasium\): pip install"):
         make("ant", 1, [0])
+
+
+def test_a_robot_is_drawn():
+    env = made(robots.Ant)
+    env.reset()
+    try:
+        picture = env.scene().picture
+    except UserError as error:
+        pytest.skip(str(error))
+    assert picture.shape == (480, 480, 3)
+    assert picture.std() > 10

@@ -66,15 +66,19 @@ def open_painter(size: int) -> Iterator[Painter]:
     except ImportError as error:
         raise NoGraphicsError(f"a view in space needs the package {error.name}; pip install {error.name}") from None
     painter = SpacePainter(size)
-    _choose_library()
+    choose_library()
     try:
         yield painter
     finally:
         painter.close()
 
 
-def _choose_library() -> None:
-    """Let `mujoco.Renderer` draw with the first library that can."""
+def choose_library() -> None:
+    """Let `mujoco.Renderer` draw with the first library that can.
+
+    Raises:
+        NoGraphicsError: none can.
+    """
     wished = os.environ.get("MUJOCO_GL", os.environ.get("PYOPENGL_PLATFORM", "")).strip().lower()
     reasons: list[str] = []
     for backend in sorted(_LIBRARIES, key=lambda name: name != wished):
