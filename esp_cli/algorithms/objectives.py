@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import huber_loss
 
-from esp_cli.networks.policies import Policies
+from esp_cli.networks.kernels.choices import Clipped
+from esp_cli.networks.policies import CompiledCategoricalPolicies, Policies
 from esp_cli.prior import Copies, Loss, Term, mean_per_seed, shares
 from esp_cli.prior.losses import Stated, Values
 
@@ -124,12 +125,21 @@ def ppo_loss(head: Any, outputs: Any, copies: Copies[Any], clip_epsilon: float, 
     batch, learned = copies.originals, copies.learned
     old_log_prob = copies.in_frame("log_prob")
 
+    advantage = batch.advantage.flatten(1).unsqueeze(1)
+
     def equation(policies: Policies, weight: float, slope: Any) -> Stated:
-        log_ratio = policies.log_prob(batch.action, learned).sub_(old_log_prob)
-        objective, by_log_ratio = clipped_surrogate(log_ratio, batch.advantage.flatten(1).unsqueeze(1), clip_epsilon)
-        loss = objective.neg_().sub_(policies.entropy(learned), alpha=entropy_coef)
-        share = shares(batch.mask, loss.shape)
+        def stated() -> tuple[Tensor, Tensor]:
+            log_ratio = policies.log_prob(batch.action, learned).sub_(old_log_prob)
+            objective, by_log_ratio = clipped_surrogate(log_ratio, advantage, clip_epsilon)
+            return objective.neg_().sub_(policies.entropy(learned), alpha=entropy_coef), by_log_ratio
+
+        share = shares(batch.mask, (len(advantage), learned, advantage.shape[2]))
         by_objective = -weight * share
+        if isinstance(policies, CompiledCategoricalPolicies):
+            weights = (by_objective, entropy_coef * by_objective)
+            clipped = Clipped(batch.action, learned, old_log_prob, advantage, clip_epsilon, *weights)
+            return Stated(lambda: stated()[0], share, policies.add_clipped_slope(slope, clipped))
+        loss, by_log_ratio = stated()
         slope = policies.add_slope(slope, batch.action, by_log_ratio.mul_(by_objective), entropy_coef * by_objective)
         return Stated(loss, share, slope)
 

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.networks.contract import WithVJP
-from esp_cli.networks.kernels.choices import CompiledChoices, Slope
+from esp_cli.networks.kernels.choices import Clipped, CompiledChoices, Slope
 from esp_cli.symmetry.frame import Frame
 
 _HALF_LOG_TAU = 0.5 * math.log(2 * math.pi)
@@ -111,17 +111,21 @@ class CompiledCategoricalPolicies(Policies):
         self._choices = CompiledChoices(rows, orders.expand(len(rows), -1, -1))
 
     def log_prob(self, action: Tensor, learned: int) -> Tensor:
-        return self._choices.log_probs.gather(1, _index(action, learned)).squeeze(1)
+        return self._choices.numbers.log_probs.gather(1, _index(action, learned)).squeeze(1)
 
     def entropy(self, learned: int) -> Tensor:
-        return self._choices.entropies[:, :learned]
+        return self._choices.numbers.entropies[:, :learned]
 
     def divergence(self, copies: slice, originals: slice) -> Tensor:
         assert originals == slice(0, 1)
-        return self._choices.gaps[:, copies]
+        return self._choices.numbers.gaps[:, copies]
 
     def add_slope(self, slope: Any, action: Tensor, by_log_prob: Tensor, by_entropy: Weights) -> list[Slope]:
         return [*(slope or []), Slope(chosen=(action, by_log_prob, by_entropy))]
+
+    def add_clipped_slope(self, slope: Any, clipped: Clipped) -> list[Slope]:
+        """Add the slope of a clipped objective and of entropies, which the kernel computes with it."""
+        return [*(slope or []), Slope(clipped=clipped)]
 
     def add_divergence_slope(self, slope: Any, weights: Weights, stop_gradient: str) -> list[Slope]:
         *before, last = slope or [Slope()]

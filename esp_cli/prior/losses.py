@@ -20,7 +20,8 @@ from esp_cli.symmetry.frame import Frame
 class Stated(NamedTuple):
     """An equation, evaluated."""
 
-    elements: Tensor  # [S, P, R], whose mean it is; or a number per seed [S], or one []
+    # [S, P, R], whose mean it is; or a number per seed [S], or one []; or what computes it where somebody asks
+    elements: Tensor | Callable[[], Tensor]
     share: Tensor | float | None  # of each element in the mean of its seed; see `shares`. None for a number.
     slope: Any  # that of the terms before, or None, with its own times its weight added
 
@@ -74,8 +75,12 @@ class Loss:
     @property
     def value(self) -> Tensor:
         """[S], or [] where nothing depends on the seed."""
-        stated, _ = self._evaluate()
-        return sum((w * (x if share is None else average(x, share)) for w, x, share in stated), start=torch.zeros(()))
+        total = torch.zeros(())
+        for weight, elements, share in self._evaluate()[0]:
+            with torch.no_grad():
+                x = elements() if callable(elements) else elements
+            total = total + weight * (x if share is None else average(x, share))
+        return total
 
     def gradients(self, parameters: Sequence[Tensor]) -> list[tuple[Sequence[Tensor], list[Tensor]]]:
         """Return parameters and the gradients by them of each seed's own loss; the same parameters may come again.
@@ -98,7 +103,7 @@ class Loss:
         return found
 
     @torch.no_grad()
-    def _evaluate(self) -> tuple[list[tuple[float, Tensor, Tensor | float | None]], list[tuple[Any, Tensor]]]:
+    def _evaluate(self) -> tuple[list[tuple[float, Any, Tensor | float | None]], list[tuple[Any, Tensor]]]:
         stated, sums = [], dict[int, tuple[Any, Any]]()
         for on, weight, equation in self.terms:
             _, before = sums.get(id(on), (on, None))

@@ -18,10 +18,11 @@ struct Choices {
 
 // What losses add to the slope by the outputs. No data: they do not, or the weight is a number.
 struct Slope {
-    int64_t learned, moves_copies, moves_originals;
-    float entropy_weight, gap_weight;
-    const int64_t *action;                                        // [S, R]
-    const float *by_log_prob, *entropy_weights, *gap_weights;     // [S, L, R], [S, R], [S, R]
+    int64_t learned, moves_copies, moves_originals, old_parts;
+    float entropy_weight, gap_weight, clip, clip_weight;
+    const int64_t *action;                                     // [S, R]
+    const float *by_log_prob, *entropy_weights, *gap_weights;  // [S, L, R], [S, R], [S, R]
+    const float *old, *advantage, *clip_weights;  // [S, 1 or L, R], [S, R], [S, R]: of the clipped objective instead
 };
 
 // Some rows of a seed.
@@ -50,54 +51,76 @@ void each_batch(const Choices &of, int64_t vectors, Use use) {
     share_out(shares, 0, vectors * LANES, [](int64_t) {}, work, [](int64_t) {});
 }
 
-// Write log_prob, prob, entropy and gap of a part; `first` are the log-probabilities of the originals.
-void softmax(const Batch &batch, int64_t part, Vec *first, Vec *log_prob) {
-    const Choices &of = batch.of;
-    Vec most = {}, sum = {}, entropy = {}, gap = {};
-    for (int64_t a = 0; a < of.actions; a++) {
+// Compute the log-probabilities of a part, and its probabilities behind them.
+void softmax(const Batch &batch, int64_t part, Vec *log_prob) {
+    const int64_t actions = batch.of.actions;
+    Vec most = {}, sum = {};
+    for (int64_t a = 0; a < actions; a++) {
         Vec x = {};
-        for (int64_t i = 0; i < batch.count; i++) x[i] = of.outputs[batch.output(part, i, a)];
+        for (int64_t i = 0; i < batch.count; i++) x[i] = batch.of.outputs[batch.output(part, i, a)];
         most = a == 0 ? x : x > most ? x : most;
         log_prob[a] = x;
     }
-    for (int64_t a = 0; a < of.actions; a++) sum += exp_of(log_prob[a] - most);
+    for (int64_t a = 0; a < actions; a++) sum += exp_of(log_prob[a] - most);
     Vec log_sum = most + log_of(sum);
+    for (int64_t a = 0; a < actions; a++) {
+        log_prob[a] -= log_sum;
+        log_prob[actions + a] = exp_of(log_prob[a]);
+    }
+}
+
+// Write what is known of a part; `first` are the log-probabilities of the originals.
+void write(const Batch &batch, int64_t part, const Vec *first, const Vec *log_prob) {
+    const Choices &of = batch.of;
+    const Vec *prob = log_prob + of.actions;
+    Vec entropy = {}, gap = {};
     for (int64_t a = 0; a < of.actions; a++) {
-        Vec own = log_prob[a] - log_sum, likely = exp_of(own);
-        if (part == 0) first[a] = own;
-        entropy -= likely * own;
-        gap += likely * (own - first[a]);
-        store(own, of.log_prob + batch.number(part, a), batch.count);
-        store(likely, of.prob + batch.number(part, a), batch.count);
+        entropy -= prob[a] * log_prob[a];
+        gap += prob[a] * (log_prob[a] - first[a]);
+        store(log_prob[a], of.log_prob + batch.number(part, a), batch.count);
+        store(prob[a], of.prob + batch.number(part, a), batch.count);
     }
     store(entropy, of.entropy + batch.row(part, of.parts), batch.count);
     store(gap, of.gap + batch.row(part, of.parts), batch.count);
 }
 
+// The slope of the clipped objective by the log-probability of what was done: rho A, or 0.
+Vec clipped(const Batch &batch, const Slope &slope, int64_t part, Vec log_prob) {
+    const int64_t row = batch.row(0, 1), old = batch.row(slope.old_parts > 1 ? part : 0, slope.old_parts);
+    Vec ratio = exp_of(log_prob - batch.read(slope.old, old)), advantage = batch.read(slope.advantage, row);
+    Vec least = Vec{} + (1 - slope.clip), most = Vec{} + (1 + slope.clip);
+    Vec bound = ratio < least ? least : ratio > most ? most : ratio, gain = ratio * advantage;
+    Vec weight = slope.clip_weights ? batch.read(slope.clip_weights, row) : Vec{} + slope.clip_weight;
+    return gain > bound * advantage ? Vec{} : gain * weight;
+}
+
 // Write the slope by the outputs of a part.
-void back(const Batch &batch, const Slope &slope, int64_t part, Vec *by, float *by_outputs) {
+void back(const Batch &batch, const Slope &slope, int64_t part, const Vec *known, Vec *by, float *by_outputs) {
     const Choices &of = batch.of;
     const bool learned = slope.action && part < slope.learned;
-    const int64_t row = batch.row(0, 1);
-    Vec by_log_prob = learned ? batch.read(slope.by_log_prob, batch.row(part, slope.learned)) : Vec{};
+    const int64_t row = batch.row(0, 1), step = 2 * of.actions;
+    const Vec *log_prob = known + part * step, *prob = log_prob + of.actions;
     Vec entropies = slope.entropy_weights ? batch.read(slope.entropy_weights, row) : Vec{} + slope.entropy_weight;
     Vec gaps = slope.gap_weights ? batch.read(slope.gap_weights, row) : Vec{} + slope.gap_weight;
     Ints taken = {};
     for (int64_t i = 0; learned && i < batch.count; i++) taken[i] = static_cast<int32_t>(slope.action[row + i]);
-    Vec total = {};
+    Vec total = {}, by_log_prob = {};
+    for (int64_t a = 0; a < of.actions; a++) by_log_prob = taken == static_cast<int32_t>(a) ? log_prob[a] : by_log_prob;
+    if (learned && slope.by_log_prob)
+        by_log_prob = batch.read(slope.by_log_prob, batch.row(part, slope.learned));
+    else if (learned)
+        by_log_prob = clipped(batch, slope, part, by_log_prob);
     for (int64_t a = 0; a < of.actions; a++) {
-        Vec own = batch.read(of.log_prob, batch.number(part, a)), likely = batch.read(of.prob, batch.number(part, a));
         by[a] = Vec{};
-        if (learned) by[a] -= own * likely * entropies;
+        if (learned) by[a] -= log_prob[a] * prob[a] * entropies;
         if (learned) by[a] += taken == static_cast<int32_t>(a) ? by_log_prob : Vec{};
-        if (part > 0 && slope.moves_copies)
-            by[a] += likely * (own - batch.read(of.log_prob, batch.number(0, a))) * gaps;
+        if (part > 0 && slope.moves_copies) by[a] += prob[a] * (log_prob[a] - known[a]) * gaps;
         for (int64_t k = 1; part == 0 && slope.moves_originals && k < of.parts; k++)
-            by[a] -= batch.read(of.prob, batch.number(k, a)) * gaps;
+            by[a] -= known[k * step + of.actions + a] * gaps;
         total += by[a];
     }
     for (int64_t a = 0; a < of.actions; a++) {
-        Vec own = by[a] - batch.read(of.prob, batch.number(part, a)) * total;
+        Vec own = by[a] - prob[a] * total;
         for (int64_t i = 0; i < batch.count; i++) by_outputs[batch.output(part, i, a)] = own[i];
     }
 }
@@ -107,14 +130,20 @@ void back(const Batch &batch, const Slope &slope, int64_t part, Vec *by, float *
 extern "C" {
 
 void choose(const Choices *choices) {
-    each_batch(*choices, 2 * choices->actions, [](const Batch &batch, Vec *room) {
-        for (int64_t k = 0; k < batch.of.parts; k++) softmax(batch, k, room, room + batch.of.actions);
+    each_batch(*choices, 4 * choices->actions, [](const Batch &batch, Vec *room) {
+        for (int64_t k = 0; k < batch.of.parts; k++) {
+            Vec *own = room + (k > 0) * 2 * batch.of.actions;
+            softmax(batch, k, own);
+            write(batch, k, room, own);
+        }
     });
 }
 
 void choose_backward(const Choices *choices, const Slope *slope, float *by_outputs) {
-    each_batch(*choices, choices->actions, [=](const Batch &batch, Vec *room) {
-        for (int64_t k = 0; k < batch.of.parts; k++) back(batch, *slope, k, room, by_outputs);
+    const int64_t step = 2 * choices->actions;
+    each_batch(*choices, (choices->parts + 1) * step, [=](const Batch &batch, Vec *room) {
+        for (int64_t k = 0; k < batch.of.parts; k++) softmax(batch, k, room + k * step);
+        for (int64_t k = 0; k < batch.of.parts; k++) back(batch, *slope, k, room, room + batch.of.parts * step, by_outputs);
     });
 }
 

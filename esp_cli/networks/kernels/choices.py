@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -20,10 +21,32 @@ class _Choices(ctypes.Structure):
 
 class _Slope(ctypes.Structure):
     _fields_ = (
-        *fields(ctypes.c_int64, "learned", "moves_copies", "moves_originals"),
-        *fields(ctypes.c_float, "entropy_weight", "gap_weight"),
+        *fields(ctypes.c_int64, "learned", "moves_copies", "moves_originals", "old_parts"),
+        *fields(ctypes.c_float, "entropy_weight", "gap_weight", "clip", "clip_weight"),
         *fields(ctypes.c_void_p, "action", "by_log_prob", "entropy_weights", "gap_weights"),
+        *fields(ctypes.c_void_p, "old", "advantage", "clip_weights"),
     )
+
+
+class Clipped(NamedTuple):
+    """A clipped objective and an entropy; see `algorithms.objectives.ppo_loss`."""
+
+    action: Tensor  # of S R rows
+    learned: int  # L
+    old_log_prob: Tensor  # [S, 1 or L, R]
+    advantage: Tensor  # [S, 1, R]
+    epsilon: float
+    weight: Tensor | float  # of the objective, a number or [S, 1, R]
+    entropy_weight: Tensor | float
+
+
+class Numbers(NamedTuple):
+    """What is known of policies; the gap of a part is KL[part || original]."""
+
+    log_probs: Tensor  # [S, A, P, R]
+    probs: Tensor
+    entropies: Tensor  # [S, P, R]
+    gaps: Tensor
 
 
 class Slope(NamedTuple):
@@ -31,6 +54,7 @@ class Slope(NamedTuple):
 
     # actions of S R rows, the slope by their log-probabilities [S, L, R] and that by entropies, a number or [S, 1, R]
     chosen: tuple[Tensor, Tensor, Tensor | float] | None = None
+    clipped: Clipped | None = None  # instead of `chosen`
     gaps: tuple[Tensor | float, str] | None = None  # weights, a number or [S, 1, R], and which side is held fixed
 
 
@@ -40,23 +64,25 @@ class CompiledChoices:
     Args:
         outputs: of the network, in any layout.
         orders: [S, P, A] int64, which output of a part is the original's action.
-
-    Attributes:
-        log_probs, probs: [S, A, P, R].
-        entropies, gaps: [S, P, R]; a gap is KL[part || original].
     """
 
     def __init__(self, outputs: Tensor, orders: Tensor) -> None:
-        num_seeds, num_parts, num_actions = orders.shape
-        num_rows = outputs.shape[1] // num_parts
         self._outputs, self._orders = outputs, orders.contiguous()
-        numbers = outputs.new_empty(2, num_seeds, num_actions, num_parts, num_rows)
-        self.log_probs, self.probs = numbers.unbind(0)
-        self.entropies, self.gaps = outputs.new_empty(2, num_seeds, num_parts, num_rows).unbind(0)
-        kept = (self._orders, outputs, self.log_probs, self.probs, self.entropies, self.gaps)
-        sizes = (num_seeds, num_parts, num_rows, num_actions, torch.get_num_threads())
-        self._arguments = _Choices(*sizes, *outputs.stride(), *(x.data_ptr() for x in kept))
-        call("choices", "choose", self._arguments)
+        num_seeds, num_parts, num_actions = orders.shape
+        self._sizes = (num_seeds, num_parts, outputs.shape[1] // num_parts, num_actions, torch.get_num_threads())
+
+    def _arguments(self, *numbers: Tensor) -> _Choices:
+        kept = (self._orders, self._outputs, *numbers)
+        return _Choices(*self._sizes, *self._outputs.stride(), *(x.data_ptr() for x in kept))
+
+    @cached_property
+    def numbers(self) -> Numbers:
+        """What is known of them, computed when it is asked for."""
+        num_seeds, num_parts, num_rows, num_actions, _ = self._sizes
+        by_action = self._outputs.new_empty(2, num_seeds, num_actions, num_parts, num_rows)
+        numbers = Numbers(*by_action, *self._outputs.new_empty(2, num_seeds, num_parts, num_rows))
+        call("choices", "choose", self._arguments(*numbers))
+        return numbers
 
     def back(self, slope: Slope) -> Tensor:
         """Return the slope by the outputs, laid out as they are."""
@@ -76,9 +102,15 @@ class CompiledChoices:
             action, by_log_prob, by_entropy = slope.chosen
             asked.learned, asked.action, asked.by_log_prob = by_log_prob.shape[1], data(action), data(by_log_prob)
             asked.entropy_weight, asked.entropy_weights = weight(by_entropy)
+        if (clipped := slope.clipped) is not None:
+            asked.learned, asked.action, asked.clip = clipped.learned, data(clipped.action), clipped.epsilon
+            asked.old_parts, asked.old = clipped.old_log_prob.shape[1], data(clipped.old_log_prob)
+            asked.advantage = data(clipped.advantage)
+            asked.clip_weight, asked.clip_weights = weight(clipped.weight)
+            asked.entropy_weight, asked.entropy_weights = weight(clipped.entropy_weight)
         if slope.gaps is not None:
             weights, fixed = slope.gaps
             asked.gap_weight, asked.gap_weights = weight(weights)
             asked.moves_copies, asked.moves_originals = fixed != "transformed", fixed != "original"
-        call("choices", "choose_backward", self._arguments, asked, by_outputs)
+        call("choices", "choose_backward", self._arguments(), asked, by_outputs)
         return by_outputs

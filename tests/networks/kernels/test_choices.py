@@ -3,8 +3,9 @@
 import pytest
 import torch
 
+from esp_cli.algorithms.objectives import clipped_surrogate
 from esp_cli.networks.contract import WithVJP
-from esp_cli.networks.kernels.choices import CompiledChoices, Slope
+from esp_cli.networks.kernels.choices import Clipped, CompiledChoices, Slope
 from esp_cli.networks.policies import CategoricalPolicies, CompiledCategoricalPolicies
 from esp_cli.symmetry import transform_set
 from esp_cli.symmetry.frame import Frame
@@ -49,12 +50,27 @@ def test_what_is_stated_and_its_slopes_equal_those_of_torch(names, rows_innermos
     assert not torch.allclose(stated[1][-1], other)  # negative control
 
 
+@pytest.mark.parametrize("by_row", [False, True])
+def test_a_clipped_objective_has_the_slope_of_torch(by_row):
+    torch.manual_seed(0)
+    eager, compiled = both(("rot90",), False)
+    action, old = torch.randint(4, (3, 9, 2, 2)), -torch.rand(3, 1, 36)
+    advantage, weight = torch.randn(3, 1, 36), torch.rand(3, 1, 36) if by_row else 0.3
+    slope = clipped_surrogate(eager.log_prob(action, 2) - old, advantage, 0.2)[1]
+    assert 0 < (slope == 0).float().mean() < 1, "some are clipped"
+    theirs = eager.back(eager.add_slope(None, action, slope * weight, 0.1 * weight))[0][1]
+    asked = Clipped(action, 2, old, advantage, 0.2, weight, 0.1 * weight)
+    torch.testing.assert_close(
+        compiled.back(compiled.add_clipped_slope(None, asked))[0][1], theirs, rtol=1e-4, atol=1e-5
+    )
+
+
 def test_a_quarter_turn_of_four_moves_by_hand():
     odds = torch.tensor([[[1.0, 2.0, 3.0, 4.0], [4.0, 1.0, 2.0, 3.0]]])  # the copy says of each turned move the same
     orders = torch.tensor([[[0, 1, 2, 3], [1, 2, 3, 0]]])
     choices = CompiledChoices(odds.log(), orders)
-    torch.testing.assert_close(choices.probs[0, :, :, 0].T, torch.tensor([[0.1, 0.2, 0.3, 0.4]] * 2))
-    assert choices.gaps[0, :, 0].tolist() == pytest.approx([0.0, 0.0], abs=1e-6)
+    torch.testing.assert_close(choices.numbers.probs[0, :, :, 0].T, torch.tensor([[0.1, 0.2, 0.3, 0.4]] * 2))
+    assert choices.numbers.gaps[0, :, 0].tolist() == pytest.approx([0.0, 0.0], abs=1e-6)
     slope = Slope(chosen=(torch.tensor([2]), torch.tensor([[[1.0], [0.0]]]), 0.0))
     # log p_2 falls with the odds of every other move as these are likely: -p_a, and 1 - p_2 by its own
     assert choices.back(slope)[0].tolist() == [pytest.approx([-0.1, -0.2, 0.7, -0.4], abs=1e-6), [0.0] * 4]
@@ -68,6 +84,6 @@ def test_results_are_the_same_bits_for_a_seed_and_for_any_number_of_threads():
     def results(seeds):
         choices = CompiledChoices(outputs[seeds].contiguous(), orders[seeds])
         slope = Slope(chosen=(action[seeds], by_log_prob[seeds], 0.1), gaps=(0.2, "none"))
-        return [choices.log_probs, choices.entropies, choices.gaps, choices.back(slope)]
+        return [*choices.numbers, choices.back(slope)]
 
     assert_same_bits_alone_and_for_any_threads(results, 3)
