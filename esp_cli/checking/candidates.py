@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from esp_cli.checking.shifting import Shift
 from esp_cli.symmetry import Element, FiniteGroup, Group, build_transform, parse_elements
 from esp_cli.symmetry.admission import declares, exchangeable, scene_of
 from esp_cli.symmetry.elements import order_name
@@ -98,8 +99,10 @@ def _moved(element: Element, spaces: Spaces) -> tuple[float, ...]:
     return tuple(round(1000 * number) + 0.0 for part in parts for number in part.flatten().tolist())
 
 
-def is_declared(element: Element, spaces: Spaces) -> bool:
-    """Return whether a task's declared symmetry holds an element."""
+def is_declared(element: Element | Shift, spaces: Spaces) -> bool:
+    """Return whether a task's declared symmetry holds an element, or it declares shifts."""
+    if isinstance(element, Shift):
+        return spaces.shifts
     return declares(spaces.symmetry, spaces.num_agents)(element)
 
 

@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.checking.candidates import is_declared
+from esp_cli.checking.shifting import Shift
 from esp_cli.checking.verdicts import (
     NEGLIGIBLE,
     RANK,
@@ -64,7 +65,7 @@ Outcomes = dict[str, Tensor]
 
 def check_paired(
     make: MakeWorlds,
-    elements: Sequence[Element],
+    elements: Sequence[Element | Shift],
     most: int | None = None,
     watch: Watch = lambda *_: None,
     until: float = math.inf,
@@ -100,7 +101,7 @@ def check_paired(
         except (Exception, SystemExit):  # such states, or what was done elsewhere, are not for this task
             return None
 
-    def judge(element: Element) -> ElementVerdict:
+    def judge(element: Element | Shift) -> ElementVerdict:
         if len(elements) > _SOME and (found := few().judge(element)).outcome == "broken":
             return found
         found = everywhere().judge(element)
@@ -141,9 +142,10 @@ class _Pairs:
             near = [(_nudged(state), action) for state, action in visited]
             self._here.append(_outcomes(self._twins[0], near, None, until))
 
-    def judge(self, element: Element) -> ElementVerdict:
+    def judge(self, element: Element | Shift) -> ElementVerdict:
         """Compare the steps from the images with the images of the steps."""
-        declared, transform = is_declared(element, self._spec), build_transform([element], self._spec)
+        declared = is_declared(element, self._spec)
+        transform = element if isinstance(element, Shift) else build_transform([element], self._spec)
         try:
             there = [_outcomes(env, self._visited, transform, self._until) for env in self._twins]
         except Late:
@@ -180,7 +182,7 @@ def _visit(env: Environment, watch: Watch, until: float) -> list[tuple[Tensor, T
 
 
 def _outcomes(
-    env: Environment, visited: Sequence[tuple[Tensor, Tensor]], turned: Transform | None, until: float
+    env: Environment, visited: Sequence[tuple[Tensor, Tensor]], turned: Transform | Shift | None, until: float
 ) -> list[Step]:
     """Return the steps from each moment's states; the start's observation replaces `next` of the episode's end."""
     steps = []
@@ -266,7 +268,7 @@ def _merged(verdicts: Sequence[FieldVerdict]) -> list[FieldVerdict]:
     return list(best.values())
 
 
-def _fields(steps: Sequence[Step], spec: TaskSpec, transform: Transform | None) -> Outcomes:
+def _fields(steps: Sequence[Step], spec: TaskSpec, transform: Transform | Shift | None) -> Outcomes:
     """Return everything that the steps gave by field, transformed."""
     parts: dict[str, list[Tensor]] = {}
 

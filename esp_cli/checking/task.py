@@ -11,6 +11,7 @@ from esp_cli.checking import paired, transitions
 from esp_cli.checking.candidates import candidates, refused
 from esp_cli.checking.naming import named
 from esp_cli.checking.recorded import Transitions, collect
+from esp_cli.checking.shifting import SHIFT, Shift
 from esp_cli.checking.verdicts import ElementVerdict, Watch
 from esp_cli.symmetry import Element
 from esp_cli.symmetry.admission import scene_of
@@ -26,6 +27,7 @@ TOLERATED = {PAIRED: paired.TOLERATED, TRANSITIONS: transitions.TOLERATED}
 _COPIES, _FOREIGN = 256, 64
 """Worlds of a task that cannot be set to a state, and of a simulator of others that can, at most."""
 _EPISODES = 4096
+_UNTRIED = "shifts are tried where a task can be set to a state"
 
 
 @dataclass(frozen=True)
@@ -80,7 +82,8 @@ def check_symmetry(
 
     Args:
         make: makes E worlds for some seeds.
-        transforms: which elements, as `--transforms` takes them; by default those of `candidates`.
+        transforms: which elements, as `--transforms` takes them, or "shift"; by default those of `candidates`, and a
+            shift where the task declares that it changes nothing.
         from_transitions: use transitions of the random policy even where the task can be set to states.
         watch: told of how many steps of how many are collected, then of how many elements are judged.
         seconds: after which elements that are left are not covered; declared ones are tried first. No more than half
@@ -93,8 +96,9 @@ def check_symmetry(
     spec = make(1, [0]).spec
     if spec.roles:
         raise UserError(f"{spec.name} has roles; 'esp check symmetry' judges each role by itself")
-    elements = candidates(spec, transforms)
-    method, verdicts = judged(make, elements, from_transitions, watch, until)
+    elements = [] if transforms == SHIFT else candidates(spec, transforms)
+    shifts = [Shift(spec)] if transforms == SHIFT or (transforms is None and spec.shifts) else []
+    method, verdicts = judged(make, [*elements, *shifts], from_transitions, watch, until)
     return _reported(spec.name, method, spec, elements, verdicts, transforms)
 
 
@@ -114,18 +118,23 @@ def check_recorded(
 
 def judged(
     make: MakeWorlds,
-    elements: Sequence[Element],
+    elements: Sequence[Element | Shift],
     from_transitions: bool = False,
     watch: Watch = lambda *_: None,
     until: float = math.inf,
 ) -> tuple[str, list[ElementVerdict]]:
-    """Return the method that a task allows, and what it says of some elements until the time is over."""
+    """Return the method that a task allows, and what it says of some elements until the time is over.
+
+    A shift comes last.
+    """
     probe = make(1, [0])
     seen, native = probe.spec, probe.has("set_state")
     if from_transitions or not probe.settable():
         worlds = make(min(_COPIES, max(transitions.FEWEST, 8192 // seen.horizon)), [0])
         data = collect(worlds, _EPISODES, until=(until + time.monotonic()) / 2, watch=watch)
-        return TRANSITIONS, transitions.check_transitions(seen, data, elements, watch, until)
+        turns = [element for element in elements if isinstance(element, Element)]
+        untried = [ElementVerdict(SHIFT, seen.shifts, (), _UNTRIED)] * (len(elements) - len(turns))
+        return TRANSITIONS, [*transitions.check_transitions(seen, data, turns, watch, until), *untried]
 
     def settable(num_envs: int, seeds: Sequence[int]) -> Environment:
         env = make(num_envs, seeds)
@@ -140,7 +149,7 @@ def judged(
     return PAIRED, [verdicts[element] for element in elements]
 
 
-def _is_carried(element: Element, spaces: Spaces) -> bool:
+def _is_carried(element: Element | Shift, spaces: Spaces) -> bool:
     named = {field.name for field in spaces.state.fields}
     return spaces.joint_fields is not None or all(name in named or name == AGENTS for name, _ in element.orders)
 
@@ -153,7 +162,7 @@ def _reported(
     verdicts: Sequence[ElementVerdict],
     transforms: str | None,
 ) -> SymmetryReport:
-    holding = [e for e, verdict in zip(elements, verdicts, strict=True) if verdict.outcome == "holds"]
+    holding = [e for e, verdict in zip(elements, verdicts, strict=False) if verdict.outcome == "holds"]
     found, usable = named(holding, elements, scene_of(spaces.symmetry, spaces.num_agents))
-    left_out = {} if transforms is None else refused(spaces, transforms)
+    left_out = {} if transforms in (None, SHIFT) else refused(spaces, transforms)
     return SymmetryReport(source, method, spaces.symmetry, found, usable, tuple(verdicts), left_out)

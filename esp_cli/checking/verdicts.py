@@ -7,8 +7,9 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import Literal
+from typing import Literal, TypeVar
 
+from esp_cli.checking.shifting import Shift
 from esp_cli.symmetry import Element
 
 Watch = Callable[[int, int, str], object]
@@ -23,6 +24,9 @@ NEGLIGIBLE = 1e-3
 LATE = "not tried, as the time was over"
 LEVEL = 0.05
 """Probability with which an element that is off by the tolerance may be said to hold, at most."""
+
+
+Named = TypeVar("Named", bound=Element | Shift)
 
 
 class Late(Exception):  # noqa: N818 - what is left is not covered, which is no error
@@ -104,9 +108,9 @@ def chance(gap: float, tolerance: float, error: float) -> float:
 
 
 def verdicts_of(
-    elements: Sequence[Element],
-    judge: Callable[[Element], ElementVerdict],
-    is_declared: Callable[[Element], bool],
+    elements: Sequence[Named],
+    judge: Callable[[Named], ElementVerdict],
+    is_declared: Callable[[Named], bool],
     watch: Watch = lambda *_: None,
     until: float = math.inf,
 ) -> list[ElementVerdict]:
@@ -119,7 +123,7 @@ def verdicts_of(
         watch: told of how many elements of how many are judged.
         until: reading of `time.monotonic` from which on an element is not covered, as it is not tried.
     """
-    found = dict[Element, ElementVerdict]()
+    found = dict[Named, ElementVerdict]()
     for done, element in enumerate(sorted(elements, key=lambda one: not is_declared(one)), 1):
         try:
             stop_at(until)

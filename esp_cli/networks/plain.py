@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from esp_cli.networks.contract import VJP, ActivationName, IoSpec, Memoryless, Network, NetworkConfig
 from esp_cli.networks.kernels.library import has_compiler
 from esp_cli.networks.layers import GAINS, SeedLayerNorm, SeedLinear, SeedMLP
+from esp_cli.networks.ordering import NearestFirst
 from esp_cli.networks.perceptron import Shape, perceptron
 from esp_cli.networks.recurrent import SeedGRU
 from esp_envs.errors import UserError
@@ -53,6 +54,14 @@ class PlainConfig(CompiledConfig):
         False, description="discrete wheel pairs: one output per speed of each wheel; a pair's output is their sum"
     )
 
+    order: Literal["given", "nearest"] = Field(
+        "given", description="of like things in an observation; nearest: each set sorted by distance, the nearest first"
+    )
+
+    def ordered(self, network: Network, io: IoSpec | None) -> Network:
+        """Return a network that reads rows in this order."""
+        return network if self.order == "given" else NearestFirst(network, self.io_or_refuse(io))
+
     @property
     def products(self) -> tuple[torch.dtype, bool]:
         """How networks compute: the precision as torch names it, and whether by kernels."""
@@ -85,7 +94,7 @@ class MlpConfig(PlainConfig):
     def build(
         self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
     ) -> Network:
-        return MLP(generators, inputs, outputs, self, output_gain)
+        return self.ordered(MLP(generators, inputs, outputs, self, output_gain), io)
 
 
 class GruConfig(PlainConfig):
@@ -98,7 +107,7 @@ class GruConfig(PlainConfig):
     def build(
         self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
     ) -> Network:
-        return GRU(generators, inputs, outputs, self, output_gain)
+        return self.ordered(GRU(generators, inputs, outputs, self, output_gain), io)
 
 
 class MLP(SeedMLP, Memoryless):

@@ -17,9 +17,10 @@ from esp_cli.networks.contract import ActivationName, IoSpec
 from esp_cli.networks.kernels.library import begin, computes
 from esp_cli.networks.kernels.sets import compiled_distances, compiled_pool
 from esp_cli.networks.layers import GAINS, SeedMLP
+from esp_cli.networks.ordering import joined, place_of, reader_of, ways_to
 from esp_cli.networks.plain import CompiledConfig
 from esp_envs.errors import UserError
-from esp_envs.spec import Family, Kind, Layout
+from esp_envs.spec import Layout
 
 
 class SetShape(CompiledConfig, ABC):
@@ -71,14 +72,8 @@ class Rows:
         self.num_own = sum(where.stop - where.start for where in self.own)
         self.layout, self.near, self.compiled = layout, near, compiled
         self.families = layout.families
-        self.offsets = [_place(family) for family in layout.families]
-        own = [part.where.start for part in layout.own if part.field.is_point]
-        self.readers = [
-            own[0]
-            if own and any(part.is_point for field, _ in family.parts for part in field.parts or (field,))
-            else None
-            for family in layout.families
-        ]
+        self.offsets = [place_of(family) for family in layout.families]
+        self.readers = [reader_of(layout, family) for family in layout.families]
         located = sum(at is not None for at in self.offsets)
         each = zip(self.families, self.offsets, strict=True)
         self.widths = [family.width + (0 if at is None else 1 + located) for family, at in each]
@@ -94,12 +89,10 @@ class Rows:
         own = torch.cat([x[..., where] for where in self.own], -1) if self.own else x[..., :0]
         things = []
         for family, at, reader in zip(self.families, self.offsets, self.readers, strict=True):
-            parts = [x[..., where].unflatten(-1, (family.count, -1)) for _, where in family.parts]
-            joined = parts[0] if len(parts) == 1 else torch.cat(parts, -1)
+            numbers = joined(x, family)
             if at is not None and 0 < self.near < family.count:
-                ways = joined[..., at : at + 2] - (0 if reader is None else x[..., None, reader : reader + 2])
-                joined = nearest_things(joined, ways, self.near)
-            things.append(joined)
+                numbers = nearest_things(numbers, ways_to(numbers, x, at, reader), self.near)
+            things.append(numbers)
         return own, things
 
     def distances(self, things: Sequence[Tensor]) -> list[list[Tensor]]:
@@ -116,17 +109,6 @@ class Rows:
         for where in self.places:
             x[..., where] -= middle.repeat(1, 1, (where.stop - where.start) // 2)
         return x
-
-
-def _place(family: Family) -> int | None:
-    """Return the column of a thing's numbers at which its place begins: a point, else its first planar vector."""
-    columns, start = [], 0
-    for field, _ in family.parts:
-        for part in field.parts or (field,):
-            if part.kind == Kind.VECTOR:
-                columns.append((not part.is_point, start))
-            start += part.item_width if part is field else part.width
-    return min(columns)[1] if columns else None
 
 
 def nearest_things(things: Tensor, ways: Tensor, count: int) -> Tensor:

@@ -1,0 +1,89 @@
+"""Things of a row in the order of their distance, so that a network that knows no sets sees alike things alike."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from esp_cli.networks.contract import VJP, IoSpec, Network
+from esp_envs.errors import UserError
+from esp_envs.spec import Family, Kind, Layout
+
+
+def place_of(family: Family) -> int | None:
+    """Return the column of a thing's numbers at which its place begins: a point, else its first planar vector."""
+    columns, start = [], 0
+    for field, _ in family.parts:
+        for part in field.parts or (field,):
+            if part.kind == Kind.VECTOR:
+                columns.append((not part.is_point, start))
+            start += part.item_width if part is field else part.width
+    return min(columns)[1] if columns else None
+
+
+def reader_of(layout: Layout, family: Family) -> int | None:
+    """Return the column of the reader's own place, where things are points; None where it is the origin."""
+    own = [part.where.start for part in layout.own if part.field.is_point]
+    points = any(part.is_point for field, _ in family.parts for part in field.parts or (field,))
+    return own[0] if own and points else None
+
+
+def joined(x: Tensor, family: Family) -> Tensor:
+    """Return the numbers of a family's things [..., K, W] in rows x [..., D]."""
+    parts = [x[..., where].unflatten(-1, (family.count, -1)) for _, where in family.parts]
+    return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
+
+
+def ways_to(things: Tensor, x: Tensor, at: int, reader: int | None) -> Tensor:
+    """Return the ways [..., K, 2] from the reader of rows x to things whose places begin at number `at`."""
+    return things[..., at : at + 2] - (0 if reader is None else x[..., None, reader : reader + 2])
+
+
+class NearestFirst(Network):
+    """A network that reads observations with the things of each family sorted by distance, which no turn changes.
+
+    With landmarks [3, 4] and [0, 1] it reads [0, 1] first.
+
+    Numbers that stand behind an observation stay where they are, and so does a global state.
+    """
+
+    def __init__(self, network: Network, io: IoSpec) -> None:
+        super().__init__()
+        self.network, self.memory_width, self.team = network, network.memory_width, network.team
+        self.layout, self.joint = io.spaces.observation, io.reads == "observations"
+        self.families = [
+            (family, at, reader_of(self.layout, family))
+            for family in self.layout.families
+            if io.reads != "state" and (at := place_of(family)) is not None
+        ]
+        if not self.families and io.num_values is None:
+            raise UserError(
+                f"network.order=nearest sorts like things by distance, but {io.spaces.label} shows none with a place; "
+                "say which fields are some (Field.family), or leave it off"
+            )
+
+    def step(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        return self.network.step(self.sorted(x), memory)
+
+    def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
+        return self.network.unroll(self.sorted(x), truncation)
+
+    def unroll_agents(self, x: Tensor, truncation: int = 0) -> Tensor:
+        return self.network.unroll_agents(self.sorted(x), truncation)
+
+    def unroll_with_vjp(self, x: Tensor, truncation: int = 0) -> tuple[Tensor, VJP]:
+        return self.network.unroll_with_vjp(self.sorted(x), truncation)
+
+    @torch.no_grad()
+    def sorted(self, x: Tensor) -> Tensor:
+        """Return rows [..., D], of several observations side by side each by itself, with their things sorted."""
+        rows = x.unflatten(-1, (-1, self.layout.width)) if self.joint else x
+        y = rows.clone()
+        for family, at, reader in self.families:
+            things = joined(rows, family)
+            order = ways_to(things, rows, at, reader).square().sum(-1).argsort(stable=True, dim=-1)
+            things, start = things.gather(-2, order.unsqueeze(-1).expand_as(things)), 0
+            for field, where in family.parts:
+                y[..., where] = things[..., start : start + field.item_width].flatten(-2)
+                start += field.item_width
+        return y.flatten(-2) if self.joint else y
