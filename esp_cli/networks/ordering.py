@@ -6,6 +6,8 @@ import torch
 from torch import Tensor
 
 from esp_cli.networks.contract import VJP, IoSpec, Network
+from esp_cli.networks.kernels.library import begin, computes
+from esp_cli.networks.kernels.sets import sort_things
 from esp_envs.errors import UserError
 from esp_envs.spec import Family, Kind, Layout
 
@@ -47,12 +49,12 @@ class NearestFirst(Network):
     Numbers that stand behind an observation stay where they are, and so does a global state.
     """
 
-    def __init__(self, network: Network, io: IoSpec) -> None:
+    def __init__(self, network: Network, io: IoSpec, compiled: bool) -> None:
         super().__init__()
         self.network, self.memory_width, self.team = network, network.memory_width, network.team
-        self.layout, self.joint = io.spaces.observation, io.reads == "observations"
+        self.layout, self.joint, self.compiled = io.spaces.observation, io.reads == "observations", compiled
         self.families = [
-            (family, at, reader_of(self.layout, family))
+            (joined(torch.arange(self.layout.width), family), at, reader_of(self.layout, family))
             for family in self.layout.families
             if io.reads != "state" and (at := place_of(family)) is not None
         ]
@@ -61,6 +63,8 @@ class NearestFirst(Network):
                 f"network.order=nearest sorts like things by distance, but {io.spaces.label} shows none with a place; "
                 "say which fields are some (Field.family), or leave it off"
             )
+        if compiled:
+            begin("sets")
 
     def step(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         return self.network.step(self.sorted(x), memory)
@@ -77,13 +81,16 @@ class NearestFirst(Network):
     @torch.no_grad()
     def sorted(self, x: Tensor) -> Tensor:
         """Return rows [..., D], of several observations side by side each by itself, with their things sorted."""
-        rows = x.unflatten(-1, (-1, self.layout.width)) if self.joint else x
-        y = rows.clone()
-        for family, at, reader in self.families:
-            things = joined(rows, family)
+        if not self.families:
+            return x
+        y = x.clone(memory_format=torch.contiguous_format)
+        rows = y.view(-1, self.layout.width if self.joint else x.shape[-1])
+        for columns, at, reader in self.families:
+            if computes(self.compiled, x):
+                sort_things(rows, columns, at, reader)
+                continue
+            where = columns.to(x.device)
+            things = rows[:, where]
             order = ways_to(things, rows, at, reader).square().sum(-1).argsort(stable=True, dim=-1)
-            things, start = things.gather(-2, order.unsqueeze(-1).expand_as(things)), 0
-            for field, where in family.parts:
-                y[..., where] = things[..., start : start + field.item_width].flatten(-2)
-                start += field.item_width
-        return y.flatten(-2) if self.joint else y
+            rows[:, where] = things.gather(1, order.unsqueeze(-1).expand_as(things))
+        return y

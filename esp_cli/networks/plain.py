@@ -53,14 +53,13 @@ class PlainConfig(CompiledConfig):
     separate_parts: bool = Field(
         False, description="discrete wheel pairs: one output per speed of each wheel; a pair's output is their sum"
     )
-
     order: Literal["given", "nearest"] = Field(
         "given", description="of like things in an observation; nearest: each set sorted by distance, the nearest first"
     )
 
     def ordered(self, network: Network, io: IoSpec | None) -> Network:
         """Return a network that reads rows in this order."""
-        return network if self.order == "given" else NearestFirst(network, self.io_or_refuse(io))
+        return network if self.order == "given" else NearestFirst(network, self.io_or_refuse(io), self.products[1])
 
     @property
     def products(self) -> tuple[torch.dtype, bool]:

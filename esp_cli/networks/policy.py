@@ -43,11 +43,13 @@ class Policy(nn.Module):
         if head.compiled:
             begin("choices")
         inputs = spec.observation.width + num_extra
+        io = IoSpec(spec, "own")
         if isinstance(network, PlainConfig) and network.separate_parts:
             parts = action_parts(spec.action)
-            self.actor: Network = Separate(build_network(generators, inputs, len(parts), network, output_gain), parts)
+            built = build_network(generators, inputs, len(parts), network, output_gain, io)
+            self.actor: Network = Separate(built, parts)
         else:
-            self.actor = build_network(generators, inputs, head.num_outputs, network, output_gain, IoSpec(spec, "own"))
+            self.actor = build_network(generators, inputs, head.num_outputs, network, output_gain, io)
 
     def initial_memory(self, num_envs: int, like: Tensor) -> Tensor:
         """Return the memory [S, E * N, H] with which an episode begins."""

@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from esp_cli.export.program import program_of
 from esp_cli.networks.build import build_network
 from esp_cli.networks.contract import IoSpec
 from esp_cli.networks.ordering import NearestFirst
@@ -10,6 +11,7 @@ from esp_cli.networks.plain import GruConfig, MlpConfig
 from esp_cli.training.build import build_learner, generators
 from esp_cli.training.config import resolve_config
 from esp_envs import Discrete, Field, Items, Kind, Spaces, UserError, layout
+from tests.networks.kernels.compiler import needs_compiler
 
 POINTS = Discrete(Kind.VECTOR, ((1.0, 0.0), (-1.0, 0.0)), ("right", "left"))
 
@@ -73,6 +75,24 @@ def test_quarter_turns_keep_the_order_and_gradients_are_those_of_autograd():
     wanted = torch.autograd.grad(plain, [*network.parameters()], slope)
     for ours, theirs in zip(vjp(slope), wanted, strict=True):
         torch.testing.assert_close(ours, theirs)
+
+
+@needs_compiler
+@pytest.mark.parametrize("reads", ["own", "observations"])
+def test_kernels_sort_alike(reads):
+    own, spots = Field("position", Kind.VECTOR, is_point=True), Field("s", Kind.VECTOR, 2, family="s", is_point=True)
+    spec = spaces(MARKS, own, spots, *OTHERS)
+    further = 0 if reads == "observations" else 2
+    x = torch.randn(2, 4, 90, 18 * (3 if reads == "observations" else 1) + further).mul(4).round() / 4  # with ties
+    fast = ordered(spec, reads, MlpConfig(order="nearest", hidden=(8,), compiled=True), further)
+    assert fast.compiled
+    assert torch.equal(fast.sorted(x), ordered(spec, reads, further=further).sorted(x))
+
+
+def test_it_is_not_exported():
+    learner = build_learner(resolve_config("navigation", "mappo", overrides={"network.order": "nearest"}))
+    with pytest.raises(UserError, match="order=nearest"):
+        program_of(learner.policy)
 
 
 def test_what_has_no_sets_is_refused():

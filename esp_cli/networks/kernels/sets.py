@@ -25,6 +25,25 @@ def compiled_distances(places: Sequence[Tensor]) -> list[Tensor]:
     return list(found.split(sizes, 2))
 
 
+def sort_things(rows: Tensor, columns: Tensor, at: int, reader: int | None) -> None:
+    """Sort the things of a set by distance in rows [B, D] on the CPU, in place.
+
+    Args:
+        rows: contiguous.
+        columns: where each thing's numbers are, [K, W].
+        at: the number of a thing with which its place begins.
+        reader: the column of the place from which distances are; None for the origin.
+    """
+    own = -1 if reader is None else reader
+    call(
+        "sets",
+        "sort",
+        _shape(*rows.shape, *columns.shape, at, own, torch.get_num_threads()),
+        columns.contiguous(),
+        rows,
+    )
+
+
 class _CompiledPool(torch.autograd.Function):
     """`compiled_pool` under autograd."""
 
