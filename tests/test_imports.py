@@ -46,7 +46,7 @@ RANKS = {
 """A part may import parts of a lower rank, and itself; parts of one rank do not know each other."""
 CONTRACT_ONLY_UP_TO = RANKS["algorithms"]
 """Up to this rank, tasks are known by their contract alone; those above make environments by name."""
-CONTRACT = tuple(f"esp_envs.{name}." for name in ("spec", "base", "roles", "installed", "scene", "errors"))
+CONTRACT = tuple(f"esp_envs.{name}." for name in ("spec", "base", "roles", "views", "installed", "scene", "errors"))
 PRINTING = {"app", "commands", "console"}
 STUDIES = {"studies", "reporting"}
 ROOMS = {"typer": PRINTING, "rich": PRINTING, "esp_cli.console": PRINTING, "ray": STUDIES, "optuna": STUDIES}

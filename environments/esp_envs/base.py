@@ -277,22 +277,7 @@ class Environment(ABC):
         is uniform in a square, not in the disc: it prefers diagonals, and the task scales back what is longer than 1.
         """
         mask = self.action_mask()
-        return joined([self._drawn(role, role.own_mask(mask, where)) for role, where in self.spec.parts])
-
-    def _drawn(self, spec: TaskSpec, mask: Tensor | None) -> Tensor:
-        """Draw actions of all agents of a role [S, E, N] or [S, E, N, width]."""
-        action = spec.action
-        shape = (self.num_envs, spec.num_agents, *([action.width] if isinstance(action, Continuous) else []))
-
-        def draw(generator: torch.Generator) -> Tensor:
-            if mask is None and not isinstance(action, Continuous):
-                return torch.randint(action.count, shape, generator=generator, device=self.device)
-            return torch.rand(shape, generator=generator, device=self.device)
-
-        drawn = torch.stack([draw(generator) for generator in self.generators])
-        if mask is not None:
-            return random_choice(mask, drawn)
-        return drawn * 2 - 1 if isinstance(action, Continuous) else drawn
+        return joined([_drawn(self, role, role.own_mask(mask, where)) for role, where in self.spec.parts])
 
     def half_by_heuristic(self, action: Tensor) -> Tensor:
         """Return a joint action whose first half of the worlds follows the main heuristic, if the task has one."""
@@ -300,3 +285,19 @@ class Environment(ABC):
         if self.heuristics:
             action[:, :half] = self.heuristic()[:, :half]
         return action
+
+
+def _drawn(env: Environment, spec: TaskSpec, mask: Tensor | None) -> Tensor:
+    """Draw actions of all agents of a role [S, E, N] or [S, E, N, width]."""
+    action = spec.action
+    shape = (env.num_envs, spec.num_agents, *([action.width] if isinstance(action, Continuous) else []))
+
+    def draw(generator: torch.Generator) -> Tensor:
+        if mask is None and not isinstance(action, Continuous):
+            return torch.randint(action.count, shape, generator=generator, device=env.device)
+        return torch.rand(shape, generator=generator, device=env.device)
+
+    drawn = torch.stack([draw(generator) for generator in env.generators])
+    if mask is not None:
+        return random_choice(mask, drawn)
+    return drawn * 2 - 1 if isinstance(action, Continuous) else drawn

@@ -15,8 +15,9 @@ from esp_cli.networks.policy import Policy
 from esp_cli.networks.roles import RolesPolicy
 from esp_cli.prior import PriorConfig
 from esp_envs.base import Environment
-from esp_envs.roles import Lockstep, RoleView, without_agents
+from esp_envs.roles import without_agents
 from esp_envs.spec import TaskSpec
+from esp_envs.views import Lockstep, RoleView
 
 Generators = Sequence[torch.Generator]
 

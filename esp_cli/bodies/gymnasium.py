@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import redirect_stderr
 from importlib import import_module
+from io import StringIO
 from typing import Any, ClassVar
 
 import mujoco
@@ -170,7 +172,8 @@ def _painter(robot: Any) -> Callable[[], Any]:
 
 def _module(package: str) -> Any:
     try:
-        return import_module(package)
+        with redirect_stderr(StringIO()):  # of notices about tasks that are not used here
+            return import_module(package)
     except ImportError as error:
         missing = f"this task needs a package that is missing ({error.name})"
         raise UserError(f"{missing}: {install('gymnasium')}") from error

@@ -15,8 +15,8 @@ from esp_envs.base import Environment
 from esp_envs.errors import UserError
 from esp_envs.promises import MakeWorlds
 from esp_envs.registry import make, task_class
-from esp_envs.roles import worlds_of_role
 from esp_envs.spec import TaskSpec
+from esp_envs.views import worlds_of_role
 
 _HORIZON = 50
 """Steps of an episode, at most, where a task has such a setting: of a longer one only the beginning is looked at."""

@@ -104,7 +104,8 @@ def _check_roles(
 ) -> int:
     """Check the symmetry of each role, while all others act at random."""
     from esp_cli.checking import check_symmetry
-    from esp_envs.roles import without_agents, worlds_of_role
+    from esp_envs.roles import without_agents
+    from esp_envs.views import worlds_of_role
 
     reports = {}
     for role in spec.roles:

@@ -33,8 +33,8 @@ from esp_envs.base import Environment
 from esp_envs.errors import UserError
 from esp_envs.mpe.frozen_prey import digest
 from esp_envs.registry import task_names
-from esp_envs.roles import OthersAtRandom, RoleView
 from esp_envs.spec import TaskSpec
+from esp_envs.views import OthersAtRandom, RoleView
 
 # modules beside the policy that a run may start from
 _FURTHER = ("critic.", "target_critic.", "mixer.", "target_mixer.", "normaliser.", "reward_scale.")

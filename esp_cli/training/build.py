@@ -25,8 +25,8 @@ from esp_envs.compass import Compass
 from esp_envs.conformance import QUICK, Subject, check
 from esp_envs.errors import UserError
 from esp_envs.registry import TASKS, make
-from esp_envs.roles import OthersAtRandom, RoleView
 from esp_envs.spec import TaskSpec
+from esp_envs.views import OthersAtRandom, RoleView
 
 
 def stream_seed(seed: int, *names: object) -> int:

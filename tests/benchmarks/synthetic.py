@@ -132,8 +132,8 @@ class Synthetic(BatchedTask):
 
     def _advance(self, world: dict[str, Tensor], action: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         scene = self.scene_of(world, action)
-        speed = 0.8 * scene.v + self.force(scene) + self._drawn(self.noise[1](scene))
-        reward = self.reward(scene) + self._drawn(self.noise[0](scene))
+        speed = 0.8 * scene.v + self.force(scene) + self._noise(self.noise[1](scene))
+        reward = self.reward(scene) + self._noise(self.noise[0](scene))
         world["velocity"] = speed
         world["position"] = world["position"] + 0.2 * speed
         world["clock"] = world["clock"] + 1
@@ -145,7 +145,7 @@ class Synthetic(BatchedTask):
             action = torch.tensor(self.spec.action.points, dtype=torch.float32)[action]
         return Scene(world["position"], world["velocity"], world["marks"], action, world["hidden"], world["clock"])
 
-    def _drawn(self, deviation: Tensor) -> Tensor:
+    def _noise(self, deviation: Tensor) -> Tensor:
         if self.quiet:
             return torch.zeros_like(deviation)
         drawn = torch.stack([torch.rand(deviation.shape[1:], generator=g) for g in self.generators])

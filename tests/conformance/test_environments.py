@@ -82,8 +82,8 @@ def align(env: Environment, other: Environment, step: int) -> None:
         chance(other)[0] = drawn[step]
 
 
-def test_every_registered_task_is_covered() -> None:
-    assert set(SETTINGS) == set(task_names())
+def test_every_task_of_this_package_is_covered() -> None:
+    assert set(SETTINGS) == {task for task in task_names() if task_class(task).__module__.startswith("esp_envs.")}
 
 
 @cases
@@ -183,7 +183,7 @@ def test_agents_of_a_team_are_interchangeable(case: Case) -> None:
         torch.testing.assert_close(after, permute(expected_after, spec.state, list(order)))
 
 
-@pytest.mark.parametrize("task", task_names())
+@pytest.mark.parametrize("task", SETTINGS)
 def test_the_card_shows_the_layout_that_the_spec_has(task: str) -> None:
     env = make(task, 1, [0])
     card = type(env).__doc__ or ""
@@ -206,7 +206,7 @@ def test_settings_are_described_and_checked(task: str) -> None:
         make(task, 1, [0], {"horizon": 0})
     env = make(task, 1, [0])
     env.reset()
-    with pytest.raises(ValueError, match="no heuristic 'wishful'"):
+    with pytest.raises(ValueError, match=r"no heuristic 'wishful'|has no hand-written policy"):
         env.heuristic("wishful")
 
 

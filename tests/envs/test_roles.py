@@ -26,7 +26,8 @@ from esp_cli.training.config import RunConfig, resolve_config
 from esp_envs import Discrete, Field, Items, Kind, UserError, generators_for, joint_layout, layout, make, register
 from esp_envs.adapters.pettingzoo import ParallelTask
 from esp_envs.conformance import QUICK, Subject, check
-from esp_envs.roles import Lockstep, OthersAtRandom, Role, RoleView, spec_with_roles, worlds_of_role
+from esp_envs.roles import Role, spec_with_roles
+from esp_envs.views import Lockstep, OthersAtRandom, RoleView, worlds_of_role
 from tests.envs.chase import STEPS, STEPS_OR_STAY, Chase
 from tests.envs.mpe_roles import MOVES, WORDS, SpeakerListener
 

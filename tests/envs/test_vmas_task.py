@@ -15,7 +15,7 @@ from esp_envs import Environment, Field, Items, Kind, UserError, generators_for,
 from esp_envs.adapters import seed_of
 from esp_envs.adapters.simulation import groups_of
 from esp_envs.conformance import Subject, check
-from esp_envs.roles import OthersAtRandom, RoleView
+from esp_envs.views import OthersAtRandom, RoleView
 from tests.own_tasks import save_page_files
 
 vmas = pytest.importorskip("vmas", reason="VMAS comes with the extra 'vmas'")
