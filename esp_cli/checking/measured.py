@@ -26,7 +26,7 @@ def prepared(config: RunConfig) -> RunConfig:
     """Return a configuration with all that its prior leaves to be measured; others come back as they are.
 
     Transforms "discovered" become what is found; nothing found is written as "discovered:", and then there is no prior.
-    Where trust is "measured" or a "gate", each element gets its weight. That is the idea of PSE (Yu et al., 2024,
+    Where trust is "measured", each element gets its weight. That is the idea of PSE (Yu et al., 2024,
     arXiv:2401.00167), which quantifies the breaking during training; to measure it before, and how, is ours. What was
     measured stands in the configuration: nothing is measured twice.
 
@@ -122,7 +122,7 @@ def _gaps_of(
 ) -> tuple[tuple[str, float], ...]:
     if isinstance(elements, Group):
         raise UserError(
-            f"a prior that is auto, measured or a gate weighs each element, but '{transforms}' is sampled; choose a "
+            f"a prior that is auto or measured weighs each element, but '{transforms}' is sampled; choose a "
             "finite group, such as d4"
         )
     method, verdicts = judged(make_worlds, elements)

@@ -11,11 +11,12 @@ from torch.nn import functional as F
 from esp_cli.algorithms.adam import SeedAdam
 from esp_cli.checking.controls import STILL, planes
 from esp_cli.checking.recorded import Transitions
-from esp_cli.prior.gate import inputs_of, moments, orders_of_others, ridge
-from esp_envs.spec import Discrete, Spaces
+from esp_envs.spec import Discrete, Spaces, others_of
 
 _HIDDEN, _BATCH, _UPDATES, _RATE = 64, 256, 600, 5e-3
-_RIDGE = 1e-2
+_RIDGE, _LEAST = 1e-2, 1e-9
+_WIDEST_PAIRS, _WIDEST_OTHERS = 48, 160
+"""Most numbers of one agent whose products are looked at, and of all other agents, beyond which they only act."""
 _BUMPS, _BREADTH = 32, 0.6
 """Bumps for each vector, and how broad one is, in standard deviations of the vector."""
 _CELLS = 24
@@ -72,10 +73,11 @@ class Predictor:
         gram = cross = torch.zeros(())
         for start in range(0, len(outputs), _CHUNK):
             where = slice(start, start + _CHUNK)
-            features = self._features(data.episodes(where)).flatten(1, 2).unsqueeze(2)
-            parts = moments(features, outputs[where].flatten(1, 2).unsqueeze(2))
-            gram, cross = gram + parts[0], cross + parts[1]
-        return ridge(gram, cross, strength=_RIDGE)[0]
+            x = self._features(data.episodes(where)).flatten(0, 2).unsqueeze(0)
+            y = outputs[where].flatten(0, 2).unsqueeze(0)
+            gram, cross = gram + (x.mT @ x).double(), cross + (x.mT @ y).double()
+        held = _RIDGE * torch.diag_embed(gram.diagonal(dim1=-2, dim2=-1).clamp_min(_LEAST))
+        return torch.linalg.solve(gram + held, cross).float()[0]
 
     def _linear(self, data: Transitions) -> Tensor:
         count = len(data.obs)
@@ -87,11 +89,28 @@ class Predictor:
         seen = self._standard(self._seen(data))
         vectors = seen[..., self._planes].unsqueeze(-3)
         bumps = (-(vectors - self._middles).square().sum(-1) / (2 * _BREADTH**2)).exp().flatten(-2)
-        parts = [inputs_of(self._spaces, data.obs, data.action), bumps]
+        parts = [self._products(data), bumps]
         if agents > 1:
             own = torch.cat([torch.ones_like(seen[..., :1]), self._done(data)], -1)
             parts.append((torch.eye(agents).unsqueeze(-1) * own.unsqueeze(-2)).flatten(-2))
         return torch.cat(parts, -1)
+
+    def _products(self, data: Transitions) -> Tensor:
+        """Return 1, what each agent sees and does, products of two of these numbers, and the others' numbers."""
+        action, space = data.action, self._spaces.action
+        acted = F.one_hot(action, space.count).float()[..., 1:] if isinstance(space, Discrete) else action
+        columns = torch.cat([data.obs, acted], -1).movedim(-1, 0).contiguous()  # [numbers, M, T, N]
+        orders, numbers = self._orders, len(columns)
+        known = columns if len(orders) * numbers <= _WIDEST_OTHERS else columns[self._spaces.observation.width :]
+        paired = numbers if numbers <= _WIDEST_PAIRS else 0
+        products = [columns[k:] * columns[k] for k in range(paired)]
+        parts = [torch.ones_like(columns[:1]), columns, *products, *(known[..., order] for order in orders)]
+        return torch.cat(parts).movedim(0, -1)
+
+    @property
+    def _orders(self) -> list[list[int]]:
+        """Who is each agent's first other, second other and so on, in index order: N - 1 lists of N agents."""
+        return [list(order) for order in zip(*others_of(self._spaces.num_agents), strict=True)]
 
     def _standard(self, x: Tensor) -> Tensor:
         return (x - self._centre) / self._width
@@ -103,7 +122,7 @@ class Predictor:
     def _seen(self, data: Transitions) -> Tensor:
         """Return what each agent sees and does, what the others do, and who it is: [M, T, N, numbers]."""
         acted, agents = self._done(data), self._spaces.num_agents
-        others = [acted[:, :, order] for order in orders_of_others(agents)]
+        others = [acted[:, :, order] for order in self._orders]
         return torch.cat([data.obs, acted, *others, torch.eye(agents).expand(*data.obs.shape[:3], -1)], -1)
 
 

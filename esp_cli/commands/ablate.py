@@ -35,7 +35,7 @@ def ablate(
     methods: Annotated[
         list[str] | None,
         typer.Option(
-            "--methods", help="What is compared, by the names in the table: 'plain,ESP,gate'; by default all."
+            "--methods", help="What is compared, by the names in the table: 'plain,ESP,auto'; by default all."
         ),
     ] = None,
     broken_by: Annotated[

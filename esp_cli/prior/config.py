@@ -61,12 +61,12 @@ class PriorConfig(Strict):
 
     trust: Literal["full", "measured", "gate"] = Field(
         "full",
-        description="weight of a copy: 1, by how far its element is broken, or how far it is in this state and action",
+        description="weight of a copy: 1, or by how far its element is broken; gate: of earlier runs, trained no more",
     )
     doubt: float = Field(8.0, ge=0, le=1000, description="what is off by b s.d. weighs exp(-doubt b)")
     weights: dict[str, Annotated[float, Field(ge=0, le=1)]] = Field(
         {},
-        description="weight of each element by its name, 0 leaves it out; filled in where trust is measured or a gate",
+        description="weight of each element by its name, 0 leaves it out; filled in where trust is measured",
     )
 
     @model_validator(mode="before")

@@ -60,11 +60,8 @@ class Copies(Generic[Rows]):
         """Cut the originals into pieces of at most `size`, each with its own copies."""
         if size >= self.originals.count:
             return [self]
-        parts, starts = self.originals.chunks(size), range(0, self.originals.count, size)
-        return [
-            Copies(self.config, part, [g.part(at, at + size) for g in self.transforms], self.augments, self.adapt)
-            for at, part in zip(starts, parts, strict=True)
-        ]
+        parts = self.originals.chunks(size)
+        return [Copies(self.config, part, self.transforms, self.augments, self.adapt) for part in parts]
 
     @property
     def loss_rows(self) -> Rows:

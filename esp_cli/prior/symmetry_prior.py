@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.prior.copies import Copies
-from esp_cli.prior.gate import Gate, gated, moved_share
-from esp_cli.prior.seed_batch import Rows, SeedBatch
+from esp_cli.prior.seed_batch import Rows
 from esp_cli.symmetry import Transform, transform_set
 from esp_cli.symmetry.admission import carries, under_a_compass, unrestricted
 from esp_envs.errors import UserError
@@ -35,13 +34,14 @@ class SymmetryPrior:
         augments: whether copies of a batch enter the learner's own loss.
         transforms: the elements that copies are made with; None without a prior.
         strength: the probability with which a drawn element is used, 0 to 1; see `begin`.
-        gate: says which rows are copied; whoever builds a learner that asks for one sets it.
     """
 
     def __init__(
         self, config: PriorConfig, spaces: Spaces, device: torch.device | str = "cpu", replays: bool = False
     ) -> None:
         self.config = config
+        if config.trust == "gate":
+            raise UserError("prior.trust=gate is trained no more; choose measured, or evaluate what it trained")
         self._stores = config.augments and replays and config.replay == "stored"
         self.augments = config.augments and not self._stores
         active = config.augments or config.coefficient > 0
@@ -53,8 +53,6 @@ class SymmetryPrior:
             raise UserError(f"prior.copies=all needs a finite group, but '{config.transforms}' is infinite; use draw")
         self._probe = _probe(spaces, device)
         self.strength = 1.0
-        self.gate: Gate | None = None
-        self._copied: Tensor | None = None
         self._weights = self._weigh()
 
     def begin(self, progress: float) -> None:
@@ -92,11 +90,10 @@ class SymmetryPrior:
         return self.num_copies if self._stores else 0
 
     def augmented_share(self, num_seeds: int) -> Tensor:
-        """Return the share of the rows in a learner's own loss that are copies, [S]; a gate's as last drawn."""
+        """Return the share of the rows in a learner's own loss that are copies, [S]."""
         keep = self._keep()
         kept = max(keep, default=0.0) if self._draws_one else sum(keep) / max(1, len(keep))
-        copied = torch.full((num_seeds,), kept) if self._copied is None else self._copied
-        return copied * self.num_copies / (1 + self.num_copies) * self.config.augments
+        return torch.full((num_seeds,), kept) * self.num_copies / (1 + self.num_copies) * self.config.augments
 
     @property
     def recomputes(self) -> bool:
@@ -112,7 +109,7 @@ class SymmetryPrior:
         in a copy that transforming alone leaves wrong.
         """
         used = self.augments or self.config.coefficient > 0
-        return Copies(self.config, batch, self._chosen(batch, generators) if used else [], self.augments, adapt)
+        return Copies(self.config, batch, self._draw(generators) if used else [], self.augments, adapt)
 
     def alone(self, batch: Rows) -> Copies[Rows]:
         """Return a batch without copies, as a learner's losses take it."""
@@ -120,7 +117,7 @@ class SymmetryPrior:
 
     def stored(self, batch: Rows, generators: Sequence[torch.Generator]) -> list[Rows]:
         """Return the copies of new experience that a replay stores with it."""
-        return [batch.transformed(g) for g in self._chosen(batch, generators)] if self._stores else []
+        return [batch.transformed(g) for g in self._draw(generators)] if self._stores else []
 
     @torch.no_grad()
     def errors(self, batch: Rows, evaluate: Callable[[Rows], Answers]) -> dict[str, Tensor]:
@@ -134,35 +131,6 @@ class SymmetryPrior:
             return {}
         copies = Copies(self.config, batch, self._probe, augments=True)
         return {f"{name}_symmetry_error": gap for name, gap in copies.gaps(**evaluate(copies.rows)).items()}
-
-    def _chosen(self, batch: SeedBatch, generators: Sequence[torch.Generator]) -> list[Transform]:
-        """Return one transform per copy of a batch, where trust is a gate of those rows alone that it lets through."""
-        drawn = self._draw(generators)
-        if self.config.trust != "gate" or all(weight == 1 for weight in self._weights):
-            return drawn
-        if self.gate is None:
-            raise UserError("prior.trust=gate needs predictors of its task, which esp train fits; here choose measured")
-        chosen = [self._gated(self.gate, g, batch, generators) for g in drawn]
-        shares = [moved_share(g, len(generators)).to(batch.obs.device, non_blocking=True) for g in chosen]
-        self._copied = torch.stack(shares).mean(0) if shares else None
-        return chosen
-
-    def _gated(
-        self, gate: Gate, transform: Transform, batch: SeedBatch, generators: Sequence[torch.Generator]
-    ) -> Transform:
-        """Return the transform of the rows that the gate lets through; a seed draws only where it is not certain."""
-        certain = gate.is_certain(transform)
-        if all(certain):
-            return transform
-        kept = gate.kept(transform, batch.obs[:, :, : batch.action.shape[2]], batch.action)
-        of_seeds = certain * (len(generators) // len(certain))
-        chances = [
-            torch.zeros(kept.shape[1:]) if sure else torch.rand(kept.shape[1:], generator=generator)
-            for sure, generator in zip(of_seeds, generators, strict=True)
-        ]
-        chance = torch.stack(chances).to(kept.device, non_blocking=True)
-        sure = torch.tensor(certain).view(-1, 1, 1).to(kept.device, non_blocking=True)
-        return gated(transform, (chance < kept) | sure)
 
     def _draw(self, generators: Sequence[torch.Generator]) -> list[Transform]:
         keep = self._keep()
@@ -182,11 +150,7 @@ class SymmetryPrior:
         """Return for each element how likely it is used now, beside the others."""
         if self.config.trust == "full":
             return [self.strength] * len(self._weights)
-        gate = self.config.trust == "gate"  # which weighs rows instead, of elements that weigh anything
-        weights = [float(weight > 0) if gate else weight for weight in self._weights]
-        return [
-            1.0 if weight == 1 else self.strength * used for weight, used in zip(self._weights, weights, strict=True)
-        ]
+        return [1.0 if weight == 1 else self.strength * weight for weight in self._weights]
 
 
 def _probe(spaces: Spaces, device: torch.device | str) -> list[Transform]:

@@ -144,7 +144,6 @@ KINDS: Mapping[str, StudyKind] = {
             "ESP that fades": {"prior.kind": "esp", "prior.fade": 0.5},
             "auto": {"prior.kind": "auto"},
             "measured weights": {"prior.kind": "esp", "prior.trust": "measured"},
-            "gate": {"prior.kind": "esp", "prior.trust": "gate"},
             "compass": {"prior.kind": "esp", "prior.compass": 1.0},
             "relaxed weights": {
                 "prior.kind": "none",

@@ -45,7 +45,7 @@ class Frame:
 
     def orders(self, num_actions: int) -> Tensor | None:
         """Return which output of each part is the original's action [S or 1, 1 + K, A]."""
-        maps = [g.output_map for g in self._transforms if type(g) is Transform]
+        maps = [g.output_map for g in self._transforms]
         backs = [m.back for m in maps if isinstance(m, Gather) and m.sign is None]
         if self._moves_agents or len(backs) < len(self._transforms):
             return None

@@ -64,10 +64,6 @@ class Transform:
         maps = (self.obs_map, self.state_map, self.output_map)
         return all(m.is_identity for m in maps) and (self.agents is None or self.agents.is_identity)
 
-    def part(self, start: int, stop: int) -> Transform:
-        """Return what acts on the rows from `start` to `stop` of a batch."""
-        return self
-
     @property
     def num_outputs(self) -> int:
         """Numbers that a policy says of one agent: one per discrete action, or those of a continuous one."""

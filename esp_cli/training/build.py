@@ -7,7 +7,7 @@ import hashlib
 import os
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -18,7 +18,6 @@ from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.algorithms.roles import RolesLearner
 from esp_cli.networks.policy import Policy
 from esp_cli.prior.config import PriorConfig
-from esp_cli.prior.gate import fit_gate
 from esp_cli.training.config import RunConfig
 from esp_envs.base import Environment, Observation
 from esp_envs.compass import Compass
@@ -26,7 +25,6 @@ from esp_envs.conformance import QUICK, Subject, check
 from esp_envs.errors import UserError
 from esp_envs.registry import TASKS, make
 from esp_envs.spec import TaskSpec
-from esp_envs.views import OthersAtRandom, RoleView
 
 
 def stream_seed(seed: int, *names: object) -> int:
@@ -46,7 +44,6 @@ def generators(seeds: Sequence[int], *names: object) -> list[torch.Generator]:
 
 
 _LOOK_SECONDS = 2.0  # at a task of others before it is trained on
-_GATE_WORLDS = 256  # for the episodes that a gate's predictors are fitted to
 _FLOAT_BYTES = 4
 _COPIES_OF_WEIGHTS = 4  # weights, gradients, and the two moments of Adam
 _LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
@@ -97,36 +94,13 @@ def build_learner(config: RunConfig) -> Learner:
     if env.spec.roles:
         return _learner_of_roles(cls, env, settings, config)
     own, of_prior = generators(config.seeds, "learner"), generators(config.seeds, "prior")
-    learner = cls(env, settings, config.network, config.prior, own, of_prior)
-    _set_gate(learner, config)
-    return learner
+    return cls(env, settings, config.network, config.prior, own, of_prior)
 
 
 def _learner_of_roles(cls: type[Learner], env: Environment, settings: LearnerConfig, config: RunConfig) -> RolesLearner:
     names = [role.name for role in env.spec.roles]
     own, of_prior = ({name: generators(config.seeds, what, name) for name in names} for what in ("learner", "prior"))
-    learner = RolesLearner(cls, env, settings, config.network, config.prior, own, of_prior)
-    for name, part in learner.each.items():
-        _set_gate(part, config, name)
-    return learner
-
-
-def _set_gate(learner: Learner, config: RunConfig, role: str = "") -> None:
-    """Give a learner the gate that its prior asks for, which is the same whatever seeds there are."""
-    prior = config.prior.effective()
-    if prior.trust != "gate" or learner.prior.transforms is None:
-        return
-    if config.network.recurrent:
-        raise UserError("prior.trust=gate copies single steps, which a recurrent network cannot take; use mlp")
-    if learner.replays and prior.replay == "stored":
-        raise UserError("prior.trust=gate copies single steps, and a replay stores episodes; use prior.replay=sampled")
-    certain = {name for name, weight in prior.weights.items() if weight == 1}
-    if certain != set(prior.weights):
-        worlds = make(config.task, _GATE_WORLDS, stream_seeds((0,), "gate"), config.task_settings, config.device)
-        worlds = RoleView(OthersAtRandom(worlds), role) if role else worlds
-        exchanged = any("agents" in name for name in prior.weights)
-        gate = fit_gate(worlds, prior.doubt, certain, alike=not exchanged)
-        learner.prior.gate = replace(gate, to_environment=learner.policy.head.to_environment)
+    return RolesLearner(cls, env, settings, config.network, config.prior, own, of_prior)
 
 
 def refuse_what_does_not_fit(config: RunConfig, settings: LearnerConfig, spec: TaskSpec) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,10 +15,12 @@ from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.checking.measured import prepared
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.prior import PriorConfig, SymmetryPrior
+from esp_cli.run import Run
 from esp_cli.symmetry import build_transform, mirror, parse_elements, rotation, transform_set
 from esp_cli.training.build import build_environment, build_learner
 from esp_cli.training.checkpoint import read_policy
-from esp_cli.training.config import resolve_config
+from esp_cli.training.config import RunConfig, resolve_config
+from esp_cli.training.run_folder import RunFolder
 from esp_envs import make
 from esp_envs.compass import Compass, framed
 from esp_envs.spec import joint_layout
@@ -287,6 +290,24 @@ def test_every_learner_sees_the_compass(algorithm: str) -> None:
     learner = build_learner(config)
     assert learner.spec.observation.width == 18
     assert learner.spec == build_environment(config, 1, "x").spec
+
+
+@pytest.mark.parametrize("trust", ["measured", "gate"])
+def test_with_a_compass_nothing_is_left_to_measure(trust: str) -> None:
+    config = resolve_config("navigation", overrides={"prior.trust": trust, "prior.compass": 1.0})
+    with pytest.raises(ValueError, match="leave one of the two out"):
+        prepared(config)
+
+
+def test_a_gate_of_an_earlier_version_is_read_and_trains_no_more(tmp_path: Path) -> None:
+    train_small(tmp_path / "run", "mappo")
+    told = json.loads((tmp_path / "run" / "config.json").read_text())
+    told["prior"] |= {"trust": "gate", "weights": {"rot90": 0.5}}
+    RunFolder.create(tmp_path / "old", {name: told[name] for name in RunConfig.model_fields})
+    assert "prior.trust=gate is trained no more" in refused("train", "--resume", tmp_path / "old")
+    shutil.copy(tmp_path / "run" / "policy.safetensors", tmp_path / "old")
+    assert Run(tmp_path / "old").config.prior.trust == "gate"
+    assert Run(tmp_path / "old").evaluate(2).episodes == 2
 
 
 def test_a_robots_program_takes_no_policy_with_a_compass(tmp_path: Path) -> None:

@@ -57,13 +57,14 @@ def test_a_run_that_has_begun_takes_what_is_left_of_its_training_and_its_evaluat
 
 
 def test_what_costs_the_same_is_measured_once_and_what_trains_the_same_is_run_once(tmp_path, probed) -> None:
-    """Three runs of each method: the gate, which is ESP where nothing is broken, has another gradient elsewhere."""
-    study = small_study(
-        "ablate-breaking", tasks=("navigation",), variants=("plain", "ESP", "gate"), breakings=("wind",)
-    )
+    """Three runs of each method: measured weights are ESP where nothing is broken, and draw otherwise elsewhere."""
+    methods = ("plain", "ESP", "measured weights")
+    study = small_study("ablate-breaking", tasks=("navigation",), variants=methods, breakings=("wind",))
     found = forecast(StudyFolder(tmp_path / "s", study), [], 1, lambda done: None)
     assert probed == ["none", "esp", "esp"]
-    assert [run.name for run in found.runs if run.status == "finished"] == ["navigation-unbroken-mappo-200-gate"]
+    assert [run.name for run in found.runs if run.status == "finished"] == [
+        "navigation-unbroken-mappo-200-measured-weights"
+    ]
     assert found.core_seconds == 8 * 104.0
     assert [run.seconds for run in found.runs].count(104.0) == 8
 
