@@ -46,6 +46,7 @@ _HOMES = dict.fromkeys(__all__, "esp_envs.spec") | {
 __dir__ = __all__.copy
 _ROBOTS = ("Ant", "HalfCheetah", "Walker2d", "Humanoid", "Swimmer", "Ant4x2", "HalfCheetah2x3")
 FURTHER["esp.tasks"] = {name.lower(): f"esp_cli.bodies.gymnasium:{name}" for name in _ROBOTS}
+FURTHER["esp.tasks"]["quadruped"] = "esp_cli.bodies.walking:Quadruped"
 
 
 def __getattr__(name: str) -> Any:

@@ -76,7 +76,7 @@ class MujocoTask(_OfModel, SingleAgentTask):
     def make_single(self) -> Any:
         steps = {"max_episode_steps": self.settings.horizon, "disable_env_checker": True}
         env = _module("gymnasium").make(self.scenario, render_mode="rgb_array", **steps, **self.arguments)
-        env.unwrapped.render = _painter(env.unwrapped)
+        env.unwrapped.render = painter_of(env.unwrapped)
         return env
 
     def _layouts(self, env: Any) -> Layouts:
@@ -102,7 +102,7 @@ class MujocoTeam(_OfModel):
         robot = env.single_agent_env.unwrapped
         # where checks and pictures look for them
         env.data, env.model, env.set_state = robot.data, robot.model, robot.set_state
-        env.render_mode, env.render = "rgb_array", _painter(robot)
+        env.render_mode, env.render = "rgb_array", painter_of(robot)
         return env
 
     def _layouts(self, env: Any) -> Layouts:
@@ -156,7 +156,7 @@ class HalfCheetah2x3(MujocoTeam):
     scenario, parts, convention = "HalfCheetah", "2x3", "mamujoco_v1 HalfCheetah 2x3"
 
 
-def _painter(robot: Any) -> Callable[[], Any]:
+def painter_of(robot: Any) -> Callable[[], Any]:
     """Return what draws a robot; Gymnasium's own way needs the variable MUJOCO_GL where there is no display."""
     opened: list[Any] = []
 
