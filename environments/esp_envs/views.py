@@ -111,16 +111,21 @@ class RoleView(Environment):
 
 
 class OthersAtRandom:
-    """Worlds in which the agents of all other roles act at random, for checks of one role."""
+    """Worlds in which the agents of all other roles act at random, for checks of one role.
+
+    Attributes:
+        image: what makes of a random joint action the one that is done, as in a scene that was turned.
+    """
 
     def __init__(self, env: Environment) -> None:
         self.env = env
+        self.image: Callable[[Tensor], Tensor] = lambda action: action
 
     def reset(self, k: int) -> Observation:
         return self.env.reset()
 
     def step(self, k: int, action: Tensor) -> Step:
-        joint = self.env.random_action()
+        joint = self.image(self.env.random_action())
         where = self.env.spec.parts[k][1]
         joint[:, :, where] = joined([action, joint[:, :, :0]])
         return self.env.step(joint)

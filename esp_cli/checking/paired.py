@@ -6,8 +6,10 @@ runs from L_g s with K_g a give Y and Y'. The energy distance
     E |X - Y| - (E |X - X'| + E |Y - Y'|) / 2
 
 is 0 if and only if both have one distribution (eq. 5 and 6), for noise of any kind. A random prey or a noisy sensor is
-thus no false alarm, and no task has to turn its own noise along. A field without chance is judged state by state: one
-that differs by more than rounding is a proof.
+thus no false alarm, and no task has to turn its own noise along.
+
+Two cases need no statistics. A field without chance is judged state by state: one that differs by more than rounding is
+a proof. And where a run from the images that meets the chance of X gives X itself, both have one distribution, too.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from torch import Tensor
 
 from esp_cli.checking.candidates import is_declared
 from esp_cli.checking.shifting import Shift
+from esp_cli.checking.stepping import nudged, outcomes, stretched, visit
 from esp_cli.checking.verdicts import (
     NEGLIGIBLE,
     RANK,
@@ -33,32 +36,31 @@ from esp_cli.checking.verdicts import (
     Watch,
     chance,
     concluded,
-    stop_at,
     verdicts_of,
 )
 from esp_cli.symmetry import Element, Transform, build_transform
-from esp_envs.base import Environment, Observation, Step
+from esp_envs.base import Observation, Step
 from esp_envs.promises import MakeWorlds
 from esp_envs.spec import Layout, TaskSpec
 
 _MOST_WORLDS = 256
 _NUMBERS = 1 << 18
 """Numbers that all worlds together may show their agents at once; pictures are compared in fewer worlds."""
-MOMENTS = 8
-"""Points of an episode at which states are taken."""
 TOLERATED = 0.15
 """Standard deviations that a field with chance may be off, where it is not found broken."""
 _BOUND = 0.05
 """Where the bounded distance levels off, in standard deviations of the field."""
-_NUDGE, _ROUNDINGS, _UNCLEAR = 1e-6, 10.0, 0.05
-"""How far a state is moved to see what rounding does, how often that may be exceeded without being a mismatch, and the
-share of the states that differ by no more than that, from which nothing is said."""
+_ROUNDINGS, _UNCLEAR = 10.0, 0.05
+"""How often what rounding does may be exceeded without being a mismatch, and the share of the states that differ by no
+more than that, from which nothing is said."""
 _SOME = 8
 """Of more elements than these, each is first tried in one of so many states."""
 _FEW = 0.05
 """Share of the states further out that may differ: in some that play never reaches, contacts are solved in the order
 in which a simulator numbers them."""
 _FURTHER = "holds where play went, but further out {} would differ"
+_HERE, _THERE = (101, 102), (103, 104)
+"""Seeds of the two runs from the states, and of two from their images, which have chance of their own."""
 Outcomes = dict[str, Tensor]
 """What a step gives, by field: [M, numbers]."""
 
@@ -69,6 +71,7 @@ def check_paired(
     most: int | None = None,
     watch: Watch = lambda *_: None,
     until: float = math.inf,
+    spare: float = math.inf,
 ) -> list[ElementVerdict]:
     """Judge elements on a task that can be set to a state.
 
@@ -82,10 +85,11 @@ def check_paired(
         most: worlds in which outcomes are compared, at most.
         watch: told of how many steps of how many are taken to visit states, then of how many elements are judged.
         until: when to stop, see `verdicts_of`.
+        spare: when to stop with what nobody declared.
     """
     shown = make(1, [0]).spec
     worlds = max(64, min(most or _MOST_WORLDS, _NUMBERS // (shown.num_agents * shown.observation.width)))
-    visited = _visit(make(worlds, [0]), watch, (until + time.monotonic()) / 2)
+    visited = visit(make(worlds, [0]), watch, (until + time.monotonic()) / 2)
     if most is None:  # one step of many worlds takes less time than many steps
         states, actions = (torch.cat(part, 1) for part in zip(*visited, strict=True))
         visited = [(states, actions)]
@@ -95,7 +99,7 @@ def check_paired(
     @cache
     def further() -> _Pairs | None:
         try:
-            return _Pairs(make, [(_stretched(state, shown.state), action) for state, action in some], until)
+            return _Pairs(make, [(stretched(state, shown.state), action) for state, action in some], until)
         except Late:
             raise
         except (Exception, SystemExit):  # such states, or what was done elsewhere, are not for this task
@@ -114,7 +118,7 @@ def check_paired(
             return replace(found, fields=fields, reason=_FURTHER.format(", ".join(field.field for field in fields)))
         return found
 
-    return verdicts_of(elements, judge, lambda element: is_declared(element, shown), watch, until)
+    return verdicts_of(elements, judge, lambda element: is_declared(element, shown), watch, until, spare)
 
 
 class _Pairs:
@@ -131,101 +135,71 @@ class _Pairs:
 
     def __init__(self, make: MakeWorlds, visited: Sequence[tuple[Tensor, Tensor]], until: float) -> None:
         self._visited, self._until, worlds = visited, until, visited[0][0].shape[1]
-        self._twins = [make(worlds, [seed]) for seed in (101, 102)]
+        self._twins = [make(worlds, [seed]) for seed in _HERE]
         for env in self._twins:
             env.renews = False
-        self._spec = spec = self._twins[0].spec
-        self._here = [_outcomes(env, visited, None, until) for env in self._twins]
-        one, other = (_fields(steps, spec, None) for steps in self._here)
-        if all(torch.equal(one[name].nan_to_num(), other[name].nan_to_num()) for name in one):
-            self._twins = self._twins[:1]  # nothing is left to chance, so one run from each image will do
-            near = [(_nudged(state), action) for state, action in visited]
-            self._here.append(_outcomes(self._twins[0], near, None, until))
+        self._spec = self._twins[0].spec
+        self._here = [outcomes(env, visited, None, seed, until) for env, seed in zip(self._twins, _HERE, strict=True)]
+        near = [(nudged(state), action) for state, action in visited]
+        self._here.append(outcomes(self._twins[0], near, None, _HERE[0], until))
 
     def judge(self, element: Element | Shift) -> ElementVerdict:
         """Compare the steps from the images with the images of the steps."""
         declared = is_declared(element, self._spec)
         transform = element if isinstance(element, Shift) else build_transform([element], self._spec)
+
+        def there(twin: int, seed: int) -> Outcomes:
+            steps = outcomes(self._twins[twin], self._visited, transform, seed, self._until)
+            return _fields(steps, self._spec, None)
+
+        @cache
+        def apart() -> list[Outcomes]:
+            return [there(twin, seed) for twin, seed in enumerate(_THERE)]
+
+        first, second, near = (_fields(steps, self._spec, transform) for steps in self._here)
         try:
-            there = [_outcomes(env, self._visited, transform, self._until) for env in self._twins]
+            alike = there(0, _HERE[0])
+            verdicts = [
+                _verdict(name, first[name], second[name], alike[name], near[name])
+                or _by_distances(name, first[name], second[name], *(side[name] for side in apart()))
+                for name in first
+            ]
         except Late:
             raise
         except (Exception, SystemExit) as error:
             reason = f"the task raises in the transformed states: {type(error).__name__}: {error}"
             return ElementVerdict(element.name, declared, (), reason)
-        first, second, *nudged = (_fields(steps, self._spec, transform) for steps in self._here)
-        third, fourth = _fields(there[0], self._spec, None), _fields(there[-1], self._spec, None)
-        verdicts = [
-            _verdict(name, first[name], second[name], third[name], fourth[name], *(near[name] for near in nudged))
-            for name in first
-        ]
         return ElementVerdict(element.name, declared, tuple(_merged(verdicts)))
 
 
-def _visit(env: Environment, watch: Watch, until: float) -> list[tuple[Tensor, Tensor]]:
-    """Return states and joint actions along episodes, half of the worlds random, half by the heuristic if any.
+def _verdict(name: str, x: Tensor, x2: Tensor, y: Tensor, near: Tensor) -> FieldVerdict | None:
+    """Judge one field from its outcomes [M, numbers] state by state, where that tells; else return None.
 
-    After `until` no more steps are taken.
+    Args:
+        name: the field's.
+        x: transformed outcomes.
+        x2: the same with other chance.
+        y: outcomes from the transformed states, with the chance of x.
+        near: transformed outcomes from states that differ by about a rounding, with the chance of x.
     """
-    observation = env.reset()
-    taken = {round(k * (env.spec.horizon - 1) / MOMENTS) for k in range(MOMENTS)}
-    visited: list[tuple[Tensor, Tensor]] = []
-    for t in range(max(taken) + 1):
-        if visited and time.monotonic() > until:
-            break
-        action = env.random_action()
-        if t in taken:
-            visited.append((observation.state.clone(), action))
-        observation = env.step(env.half_by_heuristic(action)).next
-        watch(t + 1, max(taken) + 1, "steps")
-    return visited
-
-
-def _outcomes(
-    env: Environment, visited: Sequence[tuple[Tensor, Tensor]], turned: Transform | Shift | None, until: float
-) -> list[Step]:
-    """Return the steps from each moment's states; the start's observation replaces `next` of the episode's end."""
-    steps = []
-    for state, action in visited:
-        stop_at(until)
-        env.reset()  # draws chance of its own
-        start = env.set_state(state if turned is None else turned.state(state))
-        step = env.step(action if turned is None else turned.action(action))
-        steps.append(replace(step, next=start, final=step.reached, metrics={}))
-    return steps
-
-
-def _stretched(state: Tensor, layout: Layout) -> Tensor:
-    """Return states [1, E, state width] whose vectors are up to ten times as long, the same factor for all of one."""
-    factor = 10 ** torch.rand(state.shape[1], 1, generator=torch.Generator().manual_seed(0)).to(state.device)
-    out = state.clone()
-    for field, where in zip(layout.fields, layout.slices().values(), strict=True):
-        if field.kind.is_vector and not bool((state[..., where] == state[..., where].round()).all()):  # no cells
-            out[..., where] *= factor
-    return out
-
-
-def _nudged(state: Tensor) -> Tensor:
-    """Return states that differ by about what rounding leaves; whole numbers, as of cells, stay."""
-    noise = torch.randn(state.shape, generator=torch.Generator().manual_seed(0)).to(state.device)
-    return torch.where(state == state.round(), state, state + _NUDGE * (1 + state.abs()) * noise)
-
-
-def _verdict(name: str, x: Tensor, x2: Tensor, y: Tensor, y2: Tensor, near: Tensor | None = None) -> FieldVerdict:
-    """Judge one field from its outcomes [M, numbers]: x and x2 transformed, y and y2 from the transformed state.
-
-    Where nothing is left to chance, `near` are transformed outcomes from states that differ by about a rounding.
-    """
-    known = torch.isfinite(torch.stack([x, x2, y, y2])).all(-1).all(0)
-    rounding = torch.zeros(len(x)) if near is None else (x - near).abs().amax(1).cpu().nan_to_num()
-    x, x2, y, y2, rounding = (part[known] for part in (x, x2, y, y2, rounding.to(x.device)))
-    if not bool(known.any()):
+    (x, x2, y), known = _known(x, x2, y)
+    if not len(x):
         return FieldVerdict(name, "not covered", float("nan"), float("nan"))
-    scale = max(float(torch.cat([x, y]).std(0).max()), 1e-6)
+    scale = _scale(x, y)
     if name == "reward" and not bool(torch.cat([x, y]).any()):  # it never came
         return FieldVerdict(name, "not covered", 0.0, 0.0)
-    if max(float((x - x2).abs().max()), float((y - y2).abs().max())) <= NEGLIGIBLE * scale:
-        return _state_by_state(name, (x - y).abs().amax(1), _ROUNDINGS * rounding, scale)
+    rounding = (x - near[known]).abs().amax(1).nan_to_num()
+    found = _state_by_state(name, (x - y).abs().amax(1), _ROUNDINGS * rounding, scale)
+    is_certain = float((x - x2).abs().max()) <= NEGLIGIBLE * scale
+    return found if is_certain or found.outcome == "holds" else None
+
+
+def _by_distances(name: str, x: Tensor, x2: Tensor, y: Tensor, y2: Tensor) -> FieldVerdict:
+    """Judge one field with chance from four runs [M, numbers]: x and x2 transformed, y and y2 from images."""
+    (x, x2, y, y2), _ = _known(x, x2, y, y2)
+    if not len(x):
+        return FieldVerdict(name, "not covered", float("nan"), float("nan"))
+    scale = _scale(x, y)
     within, across = ((x - x2, y - y2), (x - y, x2 - y2, x - y2, x2 - y))
     # The second distance is bounded, so that rare large chance (a touch, a capture) hides no small constant fault.
     bound = _BOUND * scale
@@ -238,6 +212,16 @@ def _verdict(name: str, x: Tensor, x2: Tensor, y: Tensor, y2: Tensor, near: Tens
     worst = int(torch.where(broken, gaps, gaps * (not broken.any())).argmax())
     gap, error = float(gaps[worst]), float(errors[worst])
     return concluded(name, gap, error, bool(broken.any()), chance(gap, TOLERATED, error))
+
+
+def _known(*sides: Tensor) -> tuple[list[Tensor], Tensor]:
+    """Return the rows that are finite on all sides, and which these are."""
+    known = torch.isfinite(torch.stack(sides)).all(-1).all(0)
+    return [side[known] for side in sides], known
+
+
+def _scale(x: Tensor, y: Tensor) -> float:
+    return max(float(torch.cat([x, y]).std(0).max()), 1e-6)
 
 
 def _state_by_state(name: str, apart: Tensor, rounding: Tensor, scale: float) -> FieldVerdict:

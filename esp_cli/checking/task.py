@@ -77,6 +77,7 @@ def check_symmetry(
     from_transitions: bool = False,
     watch: Watch = lambda *_: None,
     seconds: float = math.inf,
+    spare: float = math.inf,
 ) -> SymmetryReport:
     """Judge for each element and field whether a task is symmetric.
 
@@ -88,17 +89,18 @@ def check_symmetry(
         watch: told of how many steps of how many are collected, then of how many elements are judged.
         seconds: after which elements that are left are not covered; declared ones are tried first. No more than half
             of the time that is left goes to collecting.
+        spare: seconds after which no more elements are tried that nobody declared.
 
     Raises:
         UserError: the transforms mean nothing, or the task can carry none of them.
     """
-    until = time.monotonic() + seconds
+    until, spare = time.monotonic() + seconds, time.monotonic() + spare
     spec = make(1, [0]).spec
     if spec.roles:
         raise UserError(f"{spec.name} has roles; 'esp check symmetry' judges each role by itself")
     elements = [] if transforms == SHIFT else candidates(spec, transforms)
     shifts = [Shift(spec)] if transforms == SHIFT or (transforms is None and spec.shifts) else []
-    method, verdicts = judged(make, [*elements, *shifts], from_transitions, watch, until)
+    method, verdicts = judged(make, [*elements, *shifts], from_transitions, watch, until, spare)
     return _reported(spec.name, method, spec, elements, verdicts, transforms)
 
 
@@ -122,6 +124,7 @@ def judged(
     from_transitions: bool = False,
     watch: Watch = lambda *_: None,
     until: float = math.inf,
+    spare: float = math.inf,
 ) -> tuple[str, list[ElementVerdict]]:
     """Return the method that a task allows, and what it says of some elements until the time is over.
 
@@ -142,10 +145,10 @@ def judged(
         return env
 
     carried = [element for element in elements if _is_carried(element, probe.spec)]
-    found = paired.check_paired(settable, carried, None if native else _FOREIGN, watch, until)
+    found = paired.check_paired(settable, carried, None if native else _FOREIGN, watch, until, spare)
     verdicts = dict(zip(carried, found, strict=True))
     if rest := [element for element in elements if element not in verdicts]:  # items that the simulator does not name
-        verdicts |= dict(zip(rest, judged(make, rest, True, watch, until)[1], strict=True))
+        verdicts |= dict(zip(rest, judged(make, rest, True, watch, min(until, spare))[1], strict=True))
     return PAIRED, [verdicts[element] for element in elements]
 
 

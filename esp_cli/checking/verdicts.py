@@ -113,6 +113,7 @@ def verdicts_of(
     is_declared: Callable[[Named], bool],
     watch: Watch = lambda *_: None,
     until: float = math.inf,
+    spare: float = math.inf,
 ) -> list[ElementVerdict]:
     """Judge elements, declared ones first, and tell how many are done.
 
@@ -122,11 +123,12 @@ def verdicts_of(
         is_declared: whether the task declares one.
         watch: told of how many elements of how many are judged.
         until: reading of `time.monotonic` from which on an element is not covered, as it is not tried.
+        spare: the same for elements that nobody declared.
     """
     found = dict[Named, ElementVerdict]()
     for done, element in enumerate(sorted(elements, key=lambda one: not is_declared(one)), 1):
         try:
-            stop_at(until)
+            stop_at(until if is_declared(element) else min(until, spare))
             found[element] = judge(element)
         except Late:
             found[element] = ElementVerdict(element.name, is_declared(element), (), LATE)

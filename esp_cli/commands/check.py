@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -107,14 +108,15 @@ def _check_roles(
     from esp_envs.roles import without_agents
     from esp_envs.views import worlds_of_role
 
-    reports = {}
-    for role in spec.roles:
+    reports, until = {}, time.monotonic() + seconds
+    for left, role in zip(range(len(spec.roles), 0, -1), spec.roles, strict=True):
         asked = transforms if transforms is None or role.num_agents > 1 else without_agents(transforms)
         if asked == "":
             continue
         with console.watching("check", "elements") as watch:
             make = worlds_of_role(make_worlds, role.name)
-            reports[role.name] = check_symmetry(make, asked, watch=watch, seconds=seconds)
+            rest = until - time.monotonic()
+            reports[role.name] = check_symmetry(make, asked, watch=watch, seconds=rest, spare=rest / (2 * left - 1))
 
     def show() -> None:
         for report in reports.values():

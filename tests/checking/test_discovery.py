@@ -253,7 +253,7 @@ def test_one_number_that_is_not_finite_hides_no_gap() -> None:
     x = torch.randn(500, 1, generator=torch.Generator().manual_seed(0))
     hole = x.clone()
     hole[7] = torch.nan
-    found = _verdict("reward", hole, x, x + 3, x + 3)
+    found = _verdict("reward", hole, x, x + 3, hole)
     assert (found.outcome, found.gap > 1) == ("broken", True)
 
 

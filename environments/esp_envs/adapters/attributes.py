@@ -18,7 +18,7 @@ import numpy as np
 from esp_envs.adapters import foreign
 from esp_envs.adapters.hooks import Array, Copy
 from esp_envs.adapters.pairing import Attributes, Path
-from esp_envs.spec import Field, Items, Layout
+from esp_envs.spec import Field, Items, Layout, TaskSpec
 
 _TRIED = 16  # states that are set twice, to see whether the same follows
 _UNLIKE = 0.1  # share of a number's variance that may be left to chance, of the number in the middle
@@ -101,16 +101,19 @@ def _outcome(copy: Copy, env: Any, action: Mapping[Any, Any]) -> Array:
     return np.concatenate([copy.seen(seen).ravel(), *rest]).astype(float)
 
 
-def simulated_layout(copy: Copy, observation: Layout, declared: Layout | None) -> Layout | None:
-    """Return the layout of the state of a known simulator, None where a check cannot put it into one."""
+def simulated_layout(copy: Copy, parts: Sequence[tuple[TaskSpec, slice]], declared: Layout | None) -> Layout | None:
+    """Return the layout of the state of a known simulator, None where a check cannot put it into one.
+
+    `parts` are the roles, and where their agents stand.
+    """
     seen = copy.seen(copy.start(0)[0])
     size = copy.take().size
     found = declared or copy.simulator.layout
     if found is None and seen.shape == (1, size) and np.allclose(seen[0], copy.take(), atol=1e-5):
-        found = observation
+        found = parts[0][0].observation
     if found is None or found.width != size or not _takes_effect(copy):
         return None
-    return found if declared else _with_names(copy, found, observation)
+    return found if declared else _with_names(copy, found, parts)
 
 
 def seeded_spaces(copy: Copy) -> dict[Any, Any]:
@@ -152,16 +155,19 @@ def _takes_effect(copy: Copy) -> bool:
     return bool(apart.size) and float(np.median(apart)) < _UNLIKE
 
 
-def _with_names(copy: Copy, found: Layout, observation: Layout) -> Layout:
+def _with_names(copy: Copy, found: Layout, parts: Sequence[tuple[TaskSpec, slice]]) -> Layout:
     """Call landmarks as agents see them, if a field shows them: one that changes round as they do."""
     marks = next((field for field in found.fields if field.name == "landmarks"), None)
-    for field, where in zip(observation.fields, observation.slices().values(), strict=True):
-        if marks is None or (field.kind, field.count, field.items) != (marks.kind, marks.count, marks.items):
-            continue
-        rows, state = [copy.seen(copy.start(0)[0])[:, where]], copy.take()
-        state[found.slices()[marks.name]] = np.roll(state[found.slices()[marks.name]], 2)
-        if (seen := copy.put(state)) is not None and marks.count > 1:
-            rows.append(copy.seen(seen)[:, where])
-            if np.allclose(np.roll(rows[0], 2, 1), rows[1], atol=1e-5):
+    if marks is None or marks.count < 2:
+        return found
+    before, state = copy.seen(copy.start(0)[0]), copy.take()
+    state[found.slices()[marks.name]] = np.roll(state[found.slices()[marks.name]], 2)
+    if (shown := copy.put(state)) is None:
+        return found
+    after = copy.seen(shown)
+    for role, who in parts:
+        for field, where in zip(role.observation.fields, role.observation.slices().values(), strict=True):
+            alike = (field.kind, field.count, field.items) == (marks.kind, marks.count, marks.items)
+            if alike and np.allclose(np.roll(before[who, where], 2, 1), after[who, where], atol=1e-5):
                 return Layout(tuple(replace(f, name=field.name) if f is marks else f for f in found.fields))
     return found

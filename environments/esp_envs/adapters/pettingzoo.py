@@ -153,7 +153,7 @@ class ParallelTask(CopyHooks, Environment):
         """
         one = Copy(self)
         with one.naming("put"):
-            found = simulated_layout(one, self.spec.observation, self.simulated)
+            found = simulated_layout(one, self.spec.parts, self.simulated)
             if found is None and self.simulated is None and not self.spec.roles:
                 self.attributes = deciding_attributes(one, self.spec.observation, min(self.spec.horizon, 64))
                 found = None if self.attributes is None else self.attributes.layout

@@ -1,0 +1,120 @@
+"""States along the episodes of a task, and the steps that follow from them and from their images.
+
+A run draws its chance from a seed. So the run from the images can meet the same chance as the run from the states: if
+both give the same, up to the transform, they have one distribution.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from esp_cli.checking.shifting import Shift
+from esp_cli.checking.verdicts import Watch, stop_at
+from esp_cli.symmetry import Element, Transform, build_transform
+from esp_envs.base import Environment, Step, joined
+from esp_envs.errors import UserError
+from esp_envs.spec import Continuous, Layout, TaskSpec
+from esp_envs.views import OthersAtRandom, RoleView
+
+MOMENTS = 8
+"""Points of an episode at which states are taken."""
+_NUDGE = 1e-6
+"""How far a state is moved to see what rounding does."""
+
+
+def visit(env: Environment, watch: Watch, until: float) -> list[tuple[Tensor, Tensor]]:
+    """Return states and joint actions along episodes, half of the worlds random, half by the heuristic if any.
+
+    After `until` no more steps are taken.
+    """
+    observation = env.reset()
+    taken = {round(k * (env.spec.horizon - 1) / MOMENTS) for k in range(MOMENTS)}
+    visited: list[tuple[Tensor, Tensor]] = []
+    for t in range(max(taken) + 1):
+        if visited and time.monotonic() > until:
+            break
+        action = env.random_action()
+        if t in taken:
+            visited.append((observation.state.clone(), action))
+        observation = env.step(env.half_by_heuristic(action)).next
+        watch(t + 1, max(taken) + 1, "steps")
+    return visited
+
+
+def outcomes(
+    env: Environment,
+    visited: Sequence[tuple[Tensor, Tensor]],
+    turned: Transform | Shift | None,
+    seed: int,
+    until: float,
+) -> list[Step]:
+    """Return the steps from each moment's states; the start's observation replaces `next` of the episode's end.
+
+    Args:
+        env: the worlds. Agents of other roles act at random, alike in each run, in images turned.
+        visited: states [1, E, state width] and joint actions, for each moment.
+        turned: what makes the images, None for the states themselves.
+        seed: of the run's chance.
+        until: when to stop, see `verdicts_of`.
+    """
+    _begin(env, len(visited), turned, seed)
+    steps = []
+    for state, action in visited:
+        stop_at(until)
+        env.reset()
+        start = env.set_state(state if turned is None else turned.state(state))
+        step = env.step(action if turned is None else turned.action(action))
+        steps.append(replace(step, next=start, final=step.reached, metrics={}))
+    return steps
+
+
+def _begin(env: Environment, steps: int, turned: Transform | Shift | None, seed: int) -> None:
+    """Let all that chance decides follow from a seed, and agents of other roles act alike in each run, but turned."""
+    worlds = env.inner if isinstance(env, RoleView) else env
+    if isinstance(env, RoleView) and isinstance(env.turns, OthersAtRandom):
+        _seed(worlds, 0)
+        image = _joint_image(worlds.spec, turned.elements[0].in_place if isinstance(turned, Transform) else Element())
+        drawn = iter([] if worlds.spec.masks else [worlds.random_action() for _ in range(steps)])
+        env.turns.image = lambda action: image(next(drawn, action))
+    _seed(worlds, seed)
+
+
+def _seed(env: Environment, seed: int) -> None:
+    for k, generator in enumerate(env.generators):
+        generator.manual_seed(seed + k)
+
+
+def _joint_image(spec: TaskSpec, scene: Element) -> Callable[[Tensor], Tensor]:
+    """Return what turns the joint actions of all roles; those of a role that cannot carry the element stay."""
+    maps = []
+    for role, where in spec.parts:
+        try:
+            transform = build_transform([scene], role)
+        except UserError:
+            transform = build_transform([Element()], role)
+        width = role.action.width if isinstance(role.action, Continuous) else None
+        own: tuple[slice, ...] = (slice(None), slice(None), where)
+        maps.append((transform, own if width is None else (*own, slice(width))))
+
+    return lambda action: joined([one.action(action[own]) for one, own in maps])
+
+
+def stretched(state: Tensor, layout: Layout) -> Tensor:
+    """Return states [1, E, state width] whose vectors are up to ten times as long, the same factor for all of one."""
+    factor = 10 ** torch.rand(state.shape[1], 1, generator=torch.Generator().manual_seed(0)).to(state.device)
+    out = state.clone()
+    for field, where in zip(layout.fields, layout.slices().values(), strict=True):
+        if field.kind.is_vector and not bool((state[..., where] == state[..., where].round()).all()):  # no cells
+            out[..., where] *= factor
+    return out
+
+
+def nudged(state: Tensor) -> Tensor:
+    """Return states that differ by about what rounding leaves; whole numbers, as of cells, stay."""
+    noise = torch.randn(state.shape, generator=torch.Generator().manual_seed(0)).to(state.device)
+    return torch.where(state == state.round(), state, state + _NUDGE * (1 + state.abs()) * noise)

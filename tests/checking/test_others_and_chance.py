@@ -1,0 +1,124 @@
+"""What agents of other roles do, and what chance does, decides no verdict: by hand, and with laws that are broken."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from esp_cli.checking import check_symmetry
+from esp_cli.checking.stepping import outcomes
+from esp_cli.checking.verdicts import LATE, ElementVerdict, verdicts_of
+from esp_cli.symmetry import build_transform, parse_elements
+from esp_envs import BatchedTask, Field, Kind, generators_for, layout, make, register
+from esp_envs.spec import TaskSpec
+from esp_envs.views import OthersAtRandom, RoleView, worlds_of_role
+from tests.envs.chase import STEPS, Chase
+from tests.envs.mpe_roles import WorldComm
+
+
+class Lame(Chase):
+    """The prey's steps up are longer than those down."""
+
+    def _advance(self, world, action):
+        world["prey"] = world["prey"] + 0.1 * (action[:, :, 2:] == 2).unsqueeze(-1)
+        return super()._advance(world, action)
+
+
+class Fenced(Chase):
+    """The prey is thrown back from places that it rarely reaches."""
+
+    def _advance(self, world, action):
+        given = super()._advance(world, action)
+        world["prey"] = world["prey"] - 1.0 * (world["prey"] > 4.5)
+        return given
+
+
+def of_role(cls, role: str, transforms: str):
+    task = register(cls)
+    report = check_symmetry(worlds_of_role(lambda num_envs, seeds: make(task, num_envs, seeds), role), transforms)
+    return report.elements[0]
+
+
+@pytest.mark.parametrize("role", ["hunter", "prey"])
+def test_others_act_in_images_as_in_the_scene(role: str) -> None:
+    found = of_role(Chase, role, "flip-x")
+    assert (found.outcome, found.p_value) == ("holds", 0.0)
+    assert {(field.gap, field.share) for field in found.fields} == {(0.0, 0.0)}
+
+
+@pytest.mark.parametrize(("cls", "least", "most"), [(Lame, 0.5, 0.8), (Fenced, 0.001, 0.2)])
+def test_what_breaks_the_law_of_others_is_found_in_the_states_where_it_does(cls, least: float, most: float) -> None:
+    found = of_role(cls, "hunter", "flip-x")
+    shares = {field.field: field.share for field in found.fields if field.outcome == "broken"}
+    assert least < shares["obs.prey"] < most
+
+
+def test_all_roles_actions_are_turned() -> None:
+    env = RoleView(OthersAtRandom(Chase(Chase.Settings(), 2, generators_for([0]))), "hunter")
+    transform = build_transform(parse_elements("flip-x", 2), env.spec)
+    outcomes(env, [(torch.zeros(1, 2, 3), torch.zeros(1, 2, 2, dtype=torch.int64))], transform, 1, float("inf"))
+    drawn = torch.tensor([[[0, 1, 0], [0, 0, 1]]])  # those of the one step are used up
+    assert env.turns.image(drawn).tolist() == [[[1, 0, 2], [1, 1, 1]]]
+
+
+def test_landmarks_have_the_name_by_which_a_role_sees_them() -> None:
+    pytest.importorskip("mpe2")
+    env = make(register(WorldComm), 1, [0], {"workers": 0})
+    assert env.settable()
+    assert {role.state.fields[-2].name for role in env.spec.roles} == {"things"}
+
+
+class Noisy(BatchedTask):
+    """One agent walks on a line; its reward is |x| and noise that is as large where x > 0 as where it is not."""
+
+    def _describe(self):
+        place = layout(Field("place", Kind.PSEUDOSCALAR))
+        return TaskSpec(
+            name="noisy", version=1, convention="", num_agents=1, horizon=8, observation=place, action=STEPS,
+            state=place, symmetry="flip-x", shared_reward=True,
+        )  # fmt: skip
+
+    def _start(self, generator):
+        return {"place": self.draw(1, 1, generator=generator)}
+
+    def _advance(self, world, action):
+        world["place"] = world["place"] + 0.1 * (2.0 * action - 1).unsqueeze(-1)
+        x = world["place"].squeeze(-1)
+        drawn = torch.stack([torch.randn(x.shape[1:], generator=g) for g in self.generators])
+        return x.abs() + self.noise(x, drawn), {}
+
+    def noise(self, x, drawn):
+        return drawn
+
+    def _observe(self, world):
+        return world["place"]
+
+
+class Odd(Noisy):
+    """The noise is turned with the scene, so the same chance gives another reward of the same distribution."""
+
+    def noise(self, x, drawn):
+        return drawn * x.sign()
+
+
+class Louder(Noisy):
+    """There is more noise on one side."""
+
+    def noise(self, x, drawn):
+        return drawn * (1 + 2 * (x > 0))
+
+
+@pytest.mark.parametrize(("cls", "outcome"), [(Noisy, "holds"), (Odd, "holds"), (Louder, "broken")])
+def test_the_same_chance_proves_what_holds_and_refuses_nothing(cls, outcome: str) -> None:
+    register(cls)
+    (found,) = check_symmetry(lambda num_envs, seeds: cls(cls.Settings(), num_envs, generators_for(seeds))).elements
+    reward = next(field for field in found.fields if field.field == "reward")
+    assert (found.outcome, reward.outcome) == (outcome, outcome)
+    assert (reward.share == 0) == (cls is Noisy)
+
+
+def test_what_nobody_declared_ends_first() -> None:
+    elements = parse_elements("rot90,flip-x", 1)
+    judge = lambda element: ElementVerdict(element.name, False, ())  # noqa: E731
+    found = verdicts_of(elements, judge, lambda element: element.name == "flip-x", spare=0.0)
+    assert [one.reason for one in found] == [LATE, ""]
