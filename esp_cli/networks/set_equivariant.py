@@ -187,10 +187,10 @@ class ForceActor(Memoryless):
 
     def _seen(self, x: Tensor) -> tuple[list[Tensor], Tensor]:
         """Return parts of invariant features [S, B, .], and vectors [S, B, V, 2]."""
-        parts, embedded = self.features.encoder(x)
+        parts, embedded = self.features.encoder(x, [*self.features.encoder.embed])
         own, things = self.rows.numbers(x)
         vectors, layers = [_picked(own, self.rows.own_columns[0])], iter(self.weigh)
-        for numbers, features, (of, _) in zip(things, embedded.values(), self.rows.columns, strict=True):
+        for numbers, features, (of, _) in zip(things, embedded, self.rows.columns, strict=True):
             if of:
                 mine = _picked(numbers, of)
                 scores = next(layers)(features.flatten(1, 2)).view(*mine.shape[:3], _SUMS, len(of))

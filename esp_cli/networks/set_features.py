@@ -141,6 +141,21 @@ def distances_among(places: Sequence[Tensor]) -> list[Tensor]:
     return described
 
 
+class Embedding(SeedMLP):
+    """A perceptron that ends with an activation, shared by like things."""
+
+    def __init__(self, generators: Sequence[torch.Generator], sizes: Sequence[int], config: SetShape) -> None:
+        name = config.activation
+        super().__init__(generators, sizes, name, GAINS[name], activate_output=True, compiled=config.compiled is True)
+
+    def pooled(self, *parts: Tensor, each: bool = False) -> tuple[Tensor, Tensor | None]:
+        """Return mean and maximum over the embedded things [S, B, K, .] of sets: [S, B, 2H], and where asked each."""
+        if computes(self.compiled, parts[0]):
+            return compiled_pool(parts, self._from(0), self.activation, each)
+        things = self(*parts)
+        return torch.cat([things.mean(2), things.amax(2)], -1), things
+
+
 class SetEncoder(nn.Module):
     """Features of rows that show sets.
 
@@ -151,37 +166,29 @@ class SetEncoder(nn.Module):
     def __init__(self, generators: Sequence[torch.Generator], rows: Rows, config: SetShape) -> None:
         super().__init__()
         self.rows, features = rows, config.width
-        self.own = layers(generators, (rows.num_own, features), config) if rows.num_own > features else None
+        self.own = Embedding(generators, (rows.num_own, features), config) if rows.num_own > features else None
         self.num_own = features if self.own else rows.num_own
         self.embed = nn.ModuleDict(
             {
-                family.name: layers(generators, (width + self.num_own, features, features), config)
+                family.name: Embedding(generators, (width + self.num_own, features, features), config)
                 for family, width in zip(rows.families, rows.widths, strict=True)
             }
         )
         self.width = self.num_own + 2 * features * len(rows.families)
 
-    def forward(self, x: Tensor) -> tuple[list[Tensor], dict[str, Tensor]]:
-        """Map rows x [S, B, D] to parts of their features [S, B, P], and to features of each family [S, B, K, H]."""
+    def forward(self, x: Tensor, each: Sequence[str] = ()) -> tuple[list[Tensor], list[Tensor]]:
+        """Map rows x [S, B, D] to parts of their features [S, B, P], and to features [S, B, K, H] of some families."""
         own, things = self.rows.split(x)
         own = own if self.own is None else self.own(own)
-        embedded = {}
+        features, embedded = [own], []
         for (name, embed), parts in zip(self.embed.items(), things, strict=True):
+            assert isinstance(embed, Embedding)
             beside = own.unsqueeze(2).expand(-1, -1, parts[0].shape[2], -1)
-            embedded[name] = embed(*parts, beside)
-        return [own, *map(self.pool, embedded.values())], embedded
-
-    def pool(self, things: Tensor) -> Tensor:
-        """Return mean and maximum over things [S, B, K, H]: [S, B, 2H]."""
-        if computes(self.rows.compiled, things):
-            return compiled_pool(things)
-        return torch.cat([things.mean(2), things.amax(2)], -1)
-
-
-def layers(generators: Sequence[torch.Generator], sizes: Sequence[int], config: SetShape) -> SeedMLP:
-    """Return a perceptron that ends with an activation."""
-    name = config.activation
-    return SeedMLP(generators, sizes, name, GAINS[name], activate_output=True, compiled=config.compiled is True)
+            pooled, found = embed.pooled(*parts, beside, each=name in each)
+            features.append(pooled)
+            if found is not None and name in each:
+                embedded.append(found)
+        return features, embedded
 
 
 class TeamFeatures(nn.Module):
@@ -212,22 +219,23 @@ class TeamFeatures(nn.Module):
         found = [f.name for f in layout.families if f.count == spaces.num_agents] if io.reads == "state" else []
         self.each = "agents" if "agents" in found else next(iter(found), "")
         inputs = self.encoder.width if joint else config.width * (beside > 0)
-        self.agents = layers(generators, (inputs + beside, config.width), config) if inputs else None
+        self.agents = Embedding(generators, (inputs + beside, config.width), config) if inputs else None
         self.width = self.encoder.width * (not joint) + 2 * config.width * (self.agents is not None)
 
-    def forward(self, x: Tensor, *beside: Tensor) -> tuple[list[Tensor], Tensor | None]:
-        """Map rows x [S, B, in] and numbers beside agents to features [S, B, .], and each agent's [S, B, N, H]."""
+    def forward(self, x: Tensor, *beside: Tensor, each: bool = False) -> tuple[list[Tensor], Tensor | None]:
+        """Map rows x [S, B, in] and numbers beside agents to features [S, B, .], and where asked each agent's."""
         if not self.num_agents:
-            parts, sets = self.encoder(x)
-            agents = sets.get(self.each)
+            own = [self.each] if self.each and (each or self.agents is not None) else []
+            parts, found = self.encoder(x, own)
             if self.agents is None:
-                return parts, agents
-            agents = self.agents(agents, *beside)
-            return [*parts, self.encoder.pool(agents)], agents
+                return parts, found[0] if own else None
+            pooled, agents = self.agents.pooled(*found, *beside, each=each)
+            return [*parts, pooled], agents
         seen, _ = self.encoder(x.unflatten(-1, (self.num_agents, -1)).flatten(1, 2))
         assert self.agents is not None
-        agents = self.agents(*(part.unflatten(1, (-1, self.num_agents)) for part in seen), *beside)
-        return [self.encoder.pool(agents)], agents
+        along_agents = (part.unflatten(1, (-1, self.num_agents)) for part in seen)
+        pooled, agents = self.agents.pooled(*along_agents, *beside, each=each)
+        return [pooled], agents
 
     def each_or_refuse(self, io: IoSpec) -> None:
         if not (self.num_agents or self.each):

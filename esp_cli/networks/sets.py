@@ -96,8 +96,8 @@ class SetNetwork(Memoryless):
         self.head = SeedMLP(generators, sizes, config.activation, output_gain, compiled=config.compiled is True)
 
     def forward(self, x: Tensor) -> Tensor:
-        parts, agents = self.features(x)
-        if not self.values_each:
+        parts, agents = self.features(x, each=self.values_each)
+        if agents is None or not self.values_each:
             return self.head(*parts)
         return self.head(*along(parts, agents), agents).squeeze(-1)
 
@@ -176,7 +176,8 @@ class SetMixer(nn.Module):
     def forward(self, values: Tensor, state: Tensor) -> Tensor:
         """Mix the agents' values [S, ..., N] in what is seen [S, ..., D]: [S, ...]."""
         own, rows = values.flatten(1, -2), state.flatten(1, -2)
-        parts, agents = self.features(rows[..., : self.seen])
+        parts, agents = self.features(rows[..., : self.seen], each=True)
+        assert agents is not None
         parts = [*parts, rows[..., self.seen :]]
         weights = self.own(*along(parts, agents), agents).abs()
         bias, second, offset = self.team(*parts).split((self.width, self.width, 1), -1)

@@ -45,6 +45,9 @@ GRU: dict[str, object] = {"network.name": "gru"}
 STATE: dict[str, object] = PLAIN | {"mappo.critic_input": "state", "network.compiled": True}
 SET: dict[str, object] = STATE | {"network.name": "set"}
 EIGHT: dict[str, object] = {"task.num_agents": 8}
+NEAR: dict[str, object] = SET | {"mappo.critic_input": "own", "task.density": 8, "task.sees": 8}
+"""Agents that see the eight nearest; CROWDS of them are as many agents in all worlds together."""
+CROWDS = (16, 100, 1000)
 CASES: dict[str, tuple[str, dict[str, object]]] = {
     "mappo 128 x 25, 10 x 1, plain": ("mappo", PEER_LAYOUT | PLAIN),
     "mappo 128 x 25, 10 x 1, plain, bfloat16": ("mappo", PEER_LAYOUT | PLAIN | BFLOAT16),
@@ -55,6 +58,13 @@ CASES: dict[str, tuple[str, dict[str, object]]] = {
     "mappo set, 3 agents": ("mappo", SET),
     "mappo compiled, 8 agents": ("mappo", STATE | EIGHT),
     "mappo set, 8 agents": ("mappo", SET | EIGHT),
+    **{
+        f"mappo set, nearest 8 of {agents} agents": (
+            "mappo",
+            NEAR | {"task.num_agents": agents, "mappo.num_envs": round(1000 / agents)},
+        )
+        for agents in CROWDS
+    },
     "maddpg, plain": ("maddpg", PLAIN),
     "maddpg, esp": ("maddpg", {}),
     "qmix, plain": ("qmix", PLAIN),
@@ -110,6 +120,7 @@ def measure(name: str, seeds: int, iterations: int, device: str) -> dict[str, ob
         "case": name,
         "seeds": seeds,
         "seed_steps_per_second": statistics.median(rates),
+        "microseconds_per_agent_step": 1e6 / statistics.median(rates) / learner.spec.num_agents,
         "most": max(rates),
     }
     if isinstance(learner, Mappo) and hasattr(learner.policy.actor, "layers"):
@@ -128,6 +139,7 @@ COLUMNS = {
     "seeds": ("seeds", ",d"),
     "seed_steps_per_second": ("seed-steps/s (median)", ",.0f"),
     "most": ("most", ",.0f"),
+    "microseconds_per_agent_step": ("us/agent-step", ",.1f"),
     "mflop_per_step": ("MFLOP/step", ".2f"),
     "machine_gflops": ("machine GFLOP/s", ",.0f"),
     "share_of_matrix_rate": ("share", ".0%"),

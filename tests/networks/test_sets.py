@@ -10,12 +10,11 @@ from esp_cli.networks.contract import IoSpec
 from esp_cli.networks.kernels.sets import compiled_distances, compiled_pool
 from esp_cli.networks.plain import MlpConfig
 from esp_cli.networks.set_equivariant import SetEquivariantConfig
-from esp_cli.networks.set_features import Rows, distances_among
+from esp_cli.networks.set_features import Embedding, Rows, distances_among
 from esp_cli.networks.sets import SetConfig
 from esp_cli.training.build import build_learner, generators
 from esp_cli.training.config import resolve_config
 from esp_envs import Discrete, Field, Items, Kind, Spaces, UserError, layout, make
-from tests.networks.gradients import assert_same_gradients
 from tests.networks.kernels.compiler import assert_same_bits_alone_and_for_any_threads, needs_compiler
 
 CLOSE = {"atol": 1e-5, "rtol": 1e-5}
@@ -59,16 +58,39 @@ def test_kernels_equal_torch():
         places = [torch.randn(2, 37, size, 2, generator=rng) for size in sizes]
         for ours, theirs in zip(compiled_distances(places), distances_among(places), strict=True):
             torch.testing.assert_close(ours, theirs, **CLOSE)
-    things = torch.randn(2, 19, 5, 33, generator=rng, requires_grad=True)
-    ours, theirs = compiled_pool(things), torch.cat([things.mean(2), things.amax(2)], -1)
-    torch.testing.assert_close(ours, theirs, **CLOSE)
-    assert_same_gradients(ours, theirs, torch.randn(2, 19, 66, generator=rng), [things], **CLOSE)
+
+
+@needs_compiler
+@pytest.mark.parametrize("activation", ["relu", "tanh"])
+@pytest.mark.parametrize(("rows", "things"), [(700, 3), (19, 5), (3, 300), (7, 1)])
+def test_a_pool_by_the_kernel_equals_that_by_torch(activation, rows, things):
+    rng, config = torch.Generator().manual_seed(0), SetConfig(activation=activation, width=20)
+    ours, theirs = (
+        Embedding(generators([0, 1], "x"), (7, 33, 20), config.model_copy(update={"compiled": compiled}))
+        for compiled in (True, False)
+    )
+    theirs.load_state_dict(ours.state_dict())
+    parts = [torch.randn(2, rows, things, 4, generator=rng), torch.randn(2, rows, 1, 3, generator=rng)]
+    parts = [part.requires_grad_() for part in parts]
+    given = [parts[0], parts[1].expand(-1, -1, things, -1)]
+    both = zip(ours.pooled(*given, each=True), theirs.pooled(*given, each=True), strict=True)
+    slopes = [torch.randn(2, rows, 40, generator=rng), torch.randn(2, rows, things, 20, generator=rng)]
+    sums = [0, 0]
+    for (here, there), slope in zip(both, slopes, strict=True):
+        torch.testing.assert_close(here, there, **CLOSE)
+        sums = [sums[0] + (here * slope).sum(), sums[1] + (there * slope).sum()]
+    by_ours = torch.autograd.grad(sums[0], [*ours.parameters(), *parts])
+    by_theirs = torch.autograd.grad(sums[1], [*theirs.parameters(), *parts])
+    for here, there in zip(by_ours, by_theirs, strict=True):
+        torch.testing.assert_close(here, there, atol=1e-3, rtol=1e-4)
+    with torch.no_grad():
+        assert torch.equal(ours.pooled(*given)[0], ours.pooled(*given, each=True)[0])
 
 
 @needs_compiler
 def test_a_pool_by_hand_and_the_first_of_equal_maxima_takes_the_gradient():
     things = torch.tensor([[[[1.0, 4.0], [3.0, 4.0]]]], requires_grad=True)
-    pooled = compiled_pool(things)
+    pooled, _ = compiled_pool([things], [torch.eye(2)[None], torch.zeros(1, 1, 2)], "relu", each=False)
     assert pooled.flatten().tolist() == [2.0, 4.0, 3.0, 4.0]
     pooled.backward(torch.tensor([[[10.0, 20.0, 1.0, 2.0]]]))
     assert things.grad.flatten().tolist() == [5.0, 12.0, 6.0, 10.0]
@@ -206,9 +228,15 @@ def test_wide_own_numbers_are_embedded_once():
 @needs_compiler
 def test_a_seed_gets_the_same_bits_alone_and_with_any_number_of_threads():
     places, things = [torch.randn(3, 700, 4, 2), torch.randn(3, 700, 2, 2)], torch.randn(3, 700, 4, 16)
-    assert_same_bits_alone_and_for_any_threads(
-        lambda seeds: [*compiled_distances([p[seeds] for p in places]), compiled_pool(things[seeds])], 3
-    )
+    weights = [torch.randn(3, 16, 8), torch.randn(3, 1, 8)]
+
+    def results(seeds):
+        leaves = [w[seeds].clone().requires_grad_() for w in weights]
+        pooled, _ = compiled_pool([things[seeds]], leaves, "tanh", each=False)
+        slopes = torch.autograd.grad(pooled.square().sum(), leaves)
+        return [*compiled_distances([p[seeds] for p in places]), pooled.detach(), *slopes]
+
+    assert_same_bits_alone_and_for_any_threads(results, 3)
 
 
 def joint(spec, build, reads):

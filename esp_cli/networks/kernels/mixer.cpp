@@ -90,7 +90,7 @@ void mix_backward(const Perceptron *hypernetwork, const Mixer *mixer, const floa
     const Layout net(*hypernetwork);
     const int64_t last = net.layers - 1, width = padded(net.out(last)), room = net.packed_room();
     Scratch packed = scratch(net.seeds * room);
-    auto fill = [&](int64_t seed, Span span, float *to) {
+    auto fill = [&](const Layout &net, int64_t seed, Span span, float *to) {
         const float *weight = packed.get() + (seed + 1) * room - (net.in(last) + 1) * width;
         apply(net, last, span.size(), net.kept(last, seed, span.begin), weight, to);
         for (int64_t r = 0; r < span.size(); r++) {

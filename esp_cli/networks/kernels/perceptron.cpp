@@ -17,7 +17,7 @@ void forward(const Perceptron *given, const Rows *outputs) {
 void backward(const Perceptron *given, const Rows *by_outputs, float *by_parameters, const Below *below) {
     const Layout net(*given);
     const int64_t last = net.out(net.layers - 1);
-    auto fill = [&](int64_t seed, Span span, float *to) {
+    auto fill = [&](const Layout &, int64_t seed, Span span, float *to) {
         const float *from = by_outputs->at + seed * by_outputs->seed + span.begin * by_outputs->row;
         if (padded(last) > last) std::fill(to, to + span.size() * padded(last), 0.0f);
         copy(span.size(), last, {from, by_outputs->row, by_outputs->column}, to, padded(last), 1);

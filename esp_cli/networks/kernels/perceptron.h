@@ -53,11 +53,12 @@ struct Columns {
 
 struct Perceptron {
     int64_t seeds, rows, layers, tanh, activate_output, threads, parts;
+    int64_t things;                  // rows that stay together, R is a multiple of it; else 1
     const int64_t *widths;           // layers + 1
     const float *const *parameters;  // W_1, b_1, ... of the first seed
     const int64_t *strides;          // of each parameter, from seed to seed
     const Columns *inputs;           // parts of them, side by side
-    float *hidden;                   // what hidden layers give, and an activated output; null: not kept
+    float *hidden;                   // what hidden layers give, and an activated output; null: computed again
 };
 
 // A matrix [S, R, .] to write or to read.
@@ -75,11 +76,13 @@ struct Below {
 // ---- Passes
 
 struct Layout : Perceptron {
-    Shares shares;
-    int64_t widest;
+    Shares shares;  // of rows / things
+    int64_t together, block, widest;  // of a block: groups of rows that stay together, and rows
+    int64_t first = 0, kept_rows = seeds * rows;  // of `hidden`
 
     explicit Layout(const Perceptron &given)
-        : Perceptron(given), shares(seeds, rows, PART, threads), widest(PAD) {
+        : Perceptron(given), shares(seeds, rows / things, std::max<int64_t>(1, PART / things), threads),
+          together(std::max<int64_t>(1, BLOCK / things)), block(together * things), widest(PAD) {
         for (int64_t k = 0; k <= layers; k++) widest = std::max(widest, padded(widths[k]));
     }
     int64_t in(int64_t k) const { return widths[k]; }
@@ -91,13 +94,26 @@ struct Layout : Perceptron {
     float *given(int64_t k, int64_t seed, int64_t row) const {
         int64_t below = 0;
         for (int64_t j = 0; j < k; j++) below += padded(out(j));
-        return hidden + below * seeds * rows + (seed * rows + row) * padded(out(k));
+        return hidden + below * kept_rows + (seed * rows + row - first) * padded(out(k));
+    }
+    // The same with room to keep what hidden layers give to a block that begins at some row.
+    Layout kept_at(float *room, int64_t seed, int64_t row) const {
+        Layout net = *this;
+        net.hidden = room, net.first = seed * rows + row, net.kept_rows = block;
+        return net;
     }
     // What layer k > 0 reads, which was kept.
     Matrix kept(int64_t k, int64_t seed, int64_t row) const {
         return {given(k - 1, seed, row), padded(in(k)), 1};
     }
-    // What the first layer reads: where it lies, or copied to a room of BLOCK rows.
+    // Go through the rows of a task; see `Shares::blocks`.
+    template <class Use>
+    void blocks(int64_t task, Use use) const {
+        shares.blocks(task, together, [&](int64_t seed, Span span, bool add) {
+            use(seed, Span{span.begin * things, span.end * things}, add);
+        });
+    }
+    // What the first layer reads: where it lies, or copied to a room of a block.
     Matrix read(int64_t seed, Span span, float *room) const {
         if (parts == 1 && inputs->in_rows()) return {inputs->row(seed, span.begin), inputs->strides[AXES - 1], 1};
         int64_t column = 0;
@@ -113,9 +129,14 @@ struct Layout : Perceptron {
         for (int64_t k = 0; k < layers; k++) room += (in(k) + 1) * padded(out(k));
         return room;
     }
+    int64_t hidden_room() const {
+        int64_t room = 0;
+        for (int64_t k = 0; k < layers; k++) room += activates(k) ? block * padded(out(k)) : 0;
+        return room;
+    }
     // Of a thread: blocks of what two layers give, and of the inputs.
-    int64_t block_room() const { return BLOCK * (2 * widest + in(0)); }
-    float *inputs_room(float *own) const { return own + 2 * BLOCK * widest; }
+    int64_t block_room() const { return block * (2 * widest + in(0)); }
+    float *inputs_room(float *own) const { return own + 2 * block * widest; }
 };
 
 // Copy a seed's weights and biases, layer after layer, as [in + 1, padded(out)].
@@ -137,8 +158,21 @@ void apply(const Layout &net, int64_t k, int64_t rows, Matrix from, const float 
     if (net.activates(k)) activate(to, rows * width, net.tanh);
 }
 
-// Pass blocks of rows through all layers: use(seed, rows, what the last layer gives, [rows, padded(out)]). What hidden
-// layers give is kept where there is room for it.
+// Pass a block of rows through all layers, whose packed parameters are given; return what the last one gives,
+// [rows, padded(out)]. What hidden layers give is kept where there is room for it.
+Matrix pass_block(const Layout &net, int64_t seed, Span span, const float *weight, float *own) {
+    Matrix from = net.read(seed, span, net.inputs_room(own));
+    for (int64_t k = 0; k < net.layers; k++) {
+        bool kept = net.hidden && net.activates(k);
+        float *to = kept ? net.given(k, seed, span.begin) : own + (k % 2) * net.block * net.widest;
+        apply(net, k, span.size(), from, weight, to);
+        from = {to, padded(net.out(k)), 1};
+        weight += (net.in(k) + 1) * padded(net.out(k));
+    }
+    return from;
+}
+
+// Pass blocks of rows through all layers: use(seed, rows, what the last layer gives); see `pass_block`.
 template <class Use>
 void pass(const Layout &net, Use use) {
     const int64_t room = net.packed_room();
@@ -146,17 +180,8 @@ void pass(const Layout &net, Use use) {
     share_out(
         net.shares, 0, net.block_room(), [&](int64_t s) { pack(net, s, packed.get() + s * room); },
         [&](int64_t task, float *own) {
-            net.shares.blocks(task, BLOCK, [&](int64_t seed, Span span, bool) {
-                const float *weight = packed.get() + seed * room;
-                Matrix from = net.read(seed, span, net.inputs_room(own));
-                for (int64_t k = 0; k < net.layers; k++) {
-                    bool kept = net.hidden && net.activates(k);
-                    float *to = kept ? net.given(k, seed, span.begin) : own + (k % 2) * BLOCK * net.widest;
-                    apply(net, k, span.size(), from, weight, to);
-                    from = {to, padded(net.out(k)), 1};
-                    weight += (net.in(k) + 1) * padded(net.out(k));
-                }
-                use(seed, span, from);
+            net.blocks(task, [&](int64_t seed, Span span, bool) {
+                use(seed, span, pass_block(net, seed, span, packed.get() + seed * room, own));
             });
         },
         [](int64_t) {});
@@ -196,7 +221,7 @@ void learn(const Layout &net, int64_t k, Matrix read, const float *here, int64_t
 // two blocks of `own`; the weights, turned, and the sums end where they are given.
 void pull_block(const Layout &net, int64_t seed, Span span, bool add, const float *weight, float *sum,
                 const Below &below, float *own) {
-    float *here = own, *next = own + BLOCK * net.widest;
+    float *here = own, *next = own + net.block * net.widest;
     for (int64_t k = net.layers - 1; k >= 0; k--) {
         int64_t width = padded(net.out(k)), down = padded(sent(net, k, below).size());
         if (net.activates(k)) times_slope(here, net.given(k, seed, span.begin), span.size() * width, net.tanh);
@@ -232,8 +257,8 @@ void add_up(const Layout &net, const float *from, float *gradients) {
 }
 
 // Pull gradients back: to the parameters, [S, P] in their order, and to the inputs, each where there is room for it.
-// prepare(seed) comes first; fill(seed, rows, to) writes the gradient by a block of outputs, [rows, padded(out)],
-// filled up with zeros.
+// prepare(seed) comes first; fill(net, seed, rows, to) writes the gradient by a block of outputs, [rows, padded(out)],
+// filled up with zeros. What hidden layers gave is computed again where it was not kept.
 template <class Prepare, class Fill>
 void pull(const Layout &net, float *by_parameters, const Below &below, Prepare prepare, Fill fill) {
     int64_t turned_room = 0, sum_room = 0, count = 0;
@@ -243,19 +268,23 @@ void pull(const Layout &net, float *by_parameters, const Below &below, Prepare p
         count += (net.in(k) + 1) * net.out(k);
     }
     int64_t sum_count = by_parameters ? net.shares.tasks * sum_room : 0;
-    Scratch turned = scratch(net.seeds * turned_room), sums = scratch(sum_count);
+    const int64_t room = net.hidden ? 0 : net.packed_room();
+    Scratch turned = scratch(net.seeds * turned_room), sums = scratch(sum_count), packed = scratch(net.seeds * room);
     if (net.rows == 0) std::fill(sums.get(), sums.get() + sum_count, 0.0f);
     share_out(
-        net.shares, 0, net.block_room(),
+        net.shares, 0, net.block_room() + (net.hidden ? 0 : net.hidden_room()),
         [&](int64_t s) {
             turn(net, s, below, turned.get() + s * turned_room);
+            if (!net.hidden) pack(net, s, packed.get() + s * room);
             prepare(s);
         },
         [&](int64_t task, float *own) {
-            net.shares.blocks(task, BLOCK, [&](int64_t seed, Span span, bool add) {
+            net.blocks(task, [&](int64_t seed, Span span, bool add) {
                 float *sum = by_parameters ? sums.get() + (task + 1) * sum_room : nullptr;
-                fill(seed, span, own);
-                pull_block(net, seed, span, add, turned.get() + (seed + 1) * turned_room, sum, below, own);
+                const Layout at = net.hidden ? net : net.kept_at(own + net.block_room(), seed, span.begin);
+                if (!net.hidden) pass_block(at, seed, span, packed.get() + seed * room, own);
+                fill(at, seed, span, own);
+                pull_block(at, seed, span, add, turned.get() + (seed + 1) * turned_room, sum, below, own);
             });
         },
         [&](int64_t s) {

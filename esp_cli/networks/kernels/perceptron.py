@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 from itertools import accumulate, pairwise
 from math import prod
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -32,16 +32,18 @@ class _Columns(ctypes.Structure):
 
 class _Perceptron(ctypes.Structure):
     _fields_ = (
-        *fields(ctypes.c_int64, "seeds", "rows", "layers", "tanh", "activate_output", "threads", "parts"),
+        *fields(ctypes.c_int64, "seeds", "rows", "layers", "tanh", "activate_output", "threads", "parts", "things"),
         *fields(ctypes.c_void_p, "widths", "parameters", "strides", "inputs", "hidden"),
     )
 
 
-class _Rows(ctypes.Structure):
+class RowsAt(ctypes.Structure):
+    """Where a matrix [S, R, .] lies."""
+
     _fields_ = (("at", ctypes.c_void_p), *fields(ctypes.c_int64, "seed", "row", "column"))
 
     @classmethod
-    def of(cls, x: Tensor) -> _Rows:
+    def of(cls, x: Tensor) -> RowsAt:
         return cls(x.data_ptr(), *x.stride())
 
 
@@ -88,8 +90,10 @@ class CompiledPass:
     """A pass through a perceptron to its outputs [S, B, out] that keeps its activations until its `backward`.
 
     Arguments as of `networks.perceptron.perceptron` and `Shape`. The inputs may lie anyhow in memory, and are read
-    again by the backward.
+    again by the backward. Rows are a multiple of `things`, which stay together.
     """
+
+    computes_again: ClassVar[bool] = False  # whether `backward` computes the activations again instead
 
     def __init__(
         self,
@@ -99,6 +103,7 @@ class CompiledPass:
         activate_output: bool,
         rows_innermost: bool = False,
         keep: bool = True,
+        things: int = 1,
     ) -> None:
         parts = [_counted(x.detach()) for x in inputs]
         given = [_whole_rows(p) for p in parameters]
@@ -112,7 +117,8 @@ class CompiledPass:
             shapes = ", ".join(f"{x.dtype} {list(x.shape)}" for x in inputs)
             raise UserError(f"a perceptron for float32 rows [{self._size[0]}, ..., {self._shapes[0][0]}] got {shapes}")
         activated = self._widths[1:] if activate_output else self._widths[1:-1]
-        hidden = given[0].new_empty(prod(self._size) * sum(map(padded, activated))) if keep else None
+        room = prod(self._size) * sum(map(padded, activated))
+        hidden = given[0].new_empty(room) if keep and not self.computes_again else None
         columns = (_Columns * len(parts))(*(_Columns.of(*part) for part in parts))
         tables = _tables(self._widths, tuple(p.data_ptr() for p in given), tuple(p.stride(0) for p in given))
         self._arguments = _Perceptron(
@@ -122,6 +128,7 @@ class CompiledPass:
             activate_output,
             torch.get_num_threads(),
             len(parts),
+            things,
             *map(ctypes.addressof, (*tables, columns)),
             None if hidden is None else hidden.data_ptr(),
         )
@@ -153,12 +160,12 @@ class CompiledPass:
         size = (num_seeds, width, num_rows) if columns_first else (num_seeds, num_rows, width)
         outputs = like.new_empty(size)
         outputs = outputs.transpose(1, 2) if columns_first else outputs
-        call("perceptron", "forward", self._arguments, _Rows.of(outputs))
+        call("perceptron", "forward", self._arguments, RowsAt.of(outputs))
         return outputs
 
     def _pull(self, grad: Tensor, found: Tensor | None, below: Below) -> None:
         """Write the gradients by all parameters [S, P] and by some columns of the inputs, where there is room."""
-        call("perceptron", "backward", self._arguments, _Rows.of(grad), found, below)
+        call("perceptron", "backward", self._arguments, RowsAt.of(grad), found, below)
 
     def _room(self, like: Tensor) -> Tensor:
         """Return an empty buffer [S, P] for the gradients by all parameters."""

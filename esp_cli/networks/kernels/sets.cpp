@@ -1,6 +1,6 @@
-// Distances among the things of a row, and mean and maximum over the things of a set.
+// Distances among the things of a row, and a perceptron over the things of sets with their mean and maximum.
 
-#include "vectors.h"
+#include "perceptron.h"
 
 #include <cmath>
 
@@ -89,42 +89,61 @@ void sort(const int64_t *shape, const int64_t *columns, float *rows) {
     });
 }
 
-// Mean and maximum over things: from [rows, things, width] to [rows, 2 width].
-void pool(const int64_t *shape, const float *from, float *to) {
-    const int64_t rows = shape[0], things = shape[1], width = shape[2];
-    each_rows(rows, shape[3], 0, [&](Span span, float *) {
-        for (int64_t r = span.begin; r < span.end; r++)
+// Pass the things of sets, [S, R K, in], through a perceptron that ends with an activation, and write mean and maximum
+// over each set, [S, R, 2 out], and what it gives of each thing, [S, R K, out], where there is room for it.
+void pool(const Perceptron *given, const Rows *pooled, const Rows *each) {
+    const Layout net(*given);
+    const int64_t things = net.things, width = net.out(net.layers - 1);
+    pass(net, [&](int64_t seed, Span span, Matrix from) {
+        if (each->at)
+            copy(span.size(), width, from, each->at + seed * each->seed + span.begin * each->row, each->row, 1);
+        float *to = pooled->at + seed * pooled->seed + span.begin / things * pooled->row;
+        for (const float *set = from.at; set < from.at + span.size() * from.row; set += things * from.row) {
             for (int64_t c = 0; c < width; c += LANES) {
-                const float *at = from + r * things * width + c;
-                Vec sum = load(at, width - c), most = sum;
+                Vec sum = vec(set + c), most = sum;
                 for (int64_t k = 1; k < things; k++) {
-                    Vec x = load(at + k * width, width - c);
+                    Vec x = vec(set + k * from.row + c);
                     sum += x;
                     most = x > most ? x : most;
                 }
-                store(sum * (1.0f / things), to + 2 * r * width + c, width - c);
-                store(most, to + (2 * r + 1) * width + c, width - c);
+                store(sum * (1.0f / things), to + c, width - c);
+                store(most, to + width + c, width - c);
             }
+            to += pooled->row;
+        }
     });
 }
 
-// The gradient by what `pool` reads, from that by what it gives; the first of equal maxima takes all of its share.
-void pool_backward(const int64_t *shape, const float *from, const float *given, const float *grad, float *to) {
-    const int64_t rows = shape[0], things = shape[1], width = shape[2];
-    each_rows(rows, shape[3], 0, [&](Span span, float *) {
-        for (int64_t r = span.begin; r < span.end; r++)
-            for (int64_t c = 0; c < width; c += LANES) {
-                Vec share = load(grad + 2 * r * width + c, width - c) * (1.0f / things);
-                Vec rest = load(grad + (2 * r + 1) * width + c, width - c);
-                const Vec most = load(given + (2 * r + 1) * width + c, width - c);
+// Compute the gradients by the parameters and by the inputs, from those by what `pool` writes and, where given, by what
+// the perceptron gives of each thing. The first of equal maxima takes all of its share.
+void pool_backward(const Perceptron *given, const Rows *by_pooled, const Rows *by_each, float *by_parameters,
+                   const Below *below) {
+    const Layout whole(*given);
+    const int64_t things = whole.things, last = whole.layers - 1, width = whole.out(last), row = padded(width);
+    auto fill = [&](const Layout &net, int64_t seed, Span span, float *to) {
+        const float *set = net.given(last, seed, span.begin);
+        const float *from = by_pooled->at + seed * by_pooled->seed + span.begin / things * by_pooled->row;
+        for (int64_t r = 0; r < span.size(); r += things, from += by_pooled->row, set += things * row) {
+            for (int64_t c = 0; c < row; c += LANES) {
+                Vec most = vec(set + c);
+                for (int64_t k = 1; k < things; k++) {
+                    Vec x = vec(set + k * row + c);
+                    most = x > most ? x : most;
+                }
+                Vec share = load(from + c, width - c) * (1.0f / things), rest = load(from + width + c, width - c);
                 for (int64_t k = 0; k < things; k++) {
-                    int64_t at = (r * things + k) * width + c;
-                    auto here = load(from + at, width - c) == most;
-                    store(share + (here ? rest : Vec{}), to + at, width - c);
+                    auto here = vec(set + k * row + c) == most;
+                    Vec own = share + (here ? rest : Vec{});
                     rest = here ? Vec{} : rest;
+                    if (by_each->at)
+                        own += load(by_each->at + seed * by_each->seed + (span.begin + r + k) * by_each->row + c,
+                                    width - c);
+                    vec(to + (r + k) * row + c) = own;
                 }
             }
-    });
+        }
+    };
+    pull(whole, by_parameters, *below, [](int64_t) {}, fill);
 }
 
 }

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.networks.kernels.library import call
+from esp_cli.networks.kernels.perceptron import Below, CompiledPass, RowsAt
 
 
 def _shape(*sizes: int) -> ctypes.Array[ctypes.c_int64]:
@@ -44,26 +45,71 @@ def sort_things(rows: Tensor, columns: Tensor, at: int, reader: int | None) -> N
     )
 
 
-class _CompiledPool(torch.autograd.Function):
+class _PooledPass(CompiledPass):
+    """A pass of things [S, B, K, .] whose outputs are mean and maximum over each set, [S, B, 2H].
+
+    To compute what layers give to many things costs less than to keep it.
+
+    Attributes:
+        each: what the perceptron gives of each thing [S, B, K, H], where that is asked for.
+        by_each: the gradient by that, which its owner may fill in before `backward_to`.
+    """
+
+    computes_again = True
+
+    def __init__(
+        self, parts: Sequence[Tensor], parameters: Sequence[Tensor], activation: str, keep: bool, each: bool
+    ) -> None:
+        self._sets, width = parts[0].shape[:3], parameters[-1].shape[-1]
+        self.each = parts[0].new_empty(*self._sets, width) if each else None
+        self.by_each: Tensor | None = None
+        super().__init__(parts, parameters, activation, True, keep=keep, things=self._sets[2])
+
+    def _passed(self, like: Tensor, columns_first: bool) -> Tensor:
+        outputs = like.new_empty(*self._sets[:2], 2 * self._widths[-1])
+        call("sets", "pool", self._arguments, RowsAt.of(outputs), _rows(self.each))
+        return outputs
+
+    def _pull(self, grad: Tensor, found: Tensor | None, below: Below) -> None:
+        grad, by_each = grad.contiguous(), None if self.by_each is None else self.by_each.contiguous()
+        call("sets", "pool_backward", self._arguments, RowsAt.of(grad), _rows(by_each), found, below)
+
+
+def _rows(things: Tensor | None) -> RowsAt:
+    return RowsAt() if things is None else RowsAt.of(things.flatten(1, 2))
+
+
+class _Pooled(torch.autograd.Function):
     """`compiled_pool` under autograd."""
 
     @staticmethod
-    def forward(ctx, things):  # type: ignore[no-untyped-def]
-        things = things.contiguous()
-        found = things.new_empty(*things.shape[:2], 2 * things.shape[3])
-        ctx.sizes = (things.shape[0] * things.shape[1], *things.shape[2:], torch.get_num_threads())
-        call("sets", "pool", _shape(*ctx.sizes), things, found)
-        ctx.save_for_backward(things, found)
-        return found
+    def forward(ctx, activation, each, num_parts, *tensors):  # type: ignore[no-untyped-def]
+        ctx.set_materialize_grads(False)
+        run = _PooledPass(tensors[:num_parts], tensors[num_parts:], activation, True, each)
+        ctx.num_parts, ctx.run = num_parts, run
+        ctx.save_for_backward(*tensors)  # so that autograd notices a change of them
+        things, run.each = run.each, None
+        return run.outputs.detach(), things
 
     @staticmethod
-    def backward(ctx, grad):  # type: ignore[no-untyped-def]
-        things, found = ctx.saved_tensors
-        by_things = torch.empty_like(things)
-        call("sets", "pool_backward", _shape(*ctx.sizes), things, found, grad.contiguous(), by_things)
-        return by_things
+    def backward(ctx, grad, by_each):  # type: ignore[no-untyped-def]
+        parts, first = ctx.saved_tensors[: ctx.num_parts], 3 + ctx.num_parts
+        ctx.run.by_each, grad = by_each, torch.zeros_like(ctx.run.outputs) if grad is None else grad
+        learns, asked = ctx.needs_input_grad[first:], ctx.needs_input_grad[3:first]
+        grads, below = ctx.run.backward_to(grad, learns, asked)
+        below = [None if by_x is None else by_x.view(x.shape) for by_x, x in zip(below, parts, strict=True)]
+        return None, None, None, *below, *grads
 
 
-def compiled_pool(things: Tensor) -> Tensor:
-    """Return mean and maximum over the things of a set: [S, B, K, H] to [S, B, 2H]."""
-    return _CompiledPool.apply(things)  # type: ignore[no-untyped-call]
+def compiled_pool(
+    parts: Sequence[Tensor], parameters: Sequence[Tensor], activation: str, each: bool
+) -> tuple[Tensor, Tensor | None]:
+    """Pass the things of sets [S, B, K, .] through a perceptron that ends with an activation.
+
+    Returns:
+        Mean and maximum over each set [S, B, 2H], and what the perceptron gives of each thing [S, B, K, H] where asked.
+    """
+    if torch.is_grad_enabled():
+        return _Pooled.apply(activation, each, len(parts), *parts, *parameters)  # type: ignore[no-untyped-call]
+    run = _PooledPass(parts, parameters, activation, keep=False, each=each)
+    return run.outputs, run.each

@@ -64,7 +64,7 @@ struct Shares {
 
     // most: rows of a task, while there are few parts.
     Shares(int64_t seeds, int64_t rows, int64_t most, int64_t threads) : rows(rows), parts(1) {
-        while (parts < MOST_PARTS && parts * most < rows) parts *= 2;
+        while (parts < MOST_PARTS && parts * most < rows && 2 * parts <= rows) parts *= 2;
         tasks = seeds * parts;
         busy = static_cast<int>(std::min(threads, std::max<int64_t>(1, tasks)));
     }
@@ -104,7 +104,7 @@ struct Matrix {
 };
 
 // Loops whose numbers have to stay in registers.
-#define UNROLLED _Pragma("GCC unroll 8")
+#define UNROLLED _Pragma("GCC unroll 12")
 
 template <int M, int N>
 static inline void tile(int64_t depth, Matrix a, const float *b, int64_t b_row, const float *bias, bool add, float *c,
@@ -125,35 +125,33 @@ static inline void tile(int64_t depth, Matrix a, const float *b, int64_t b_row, 
         UNROLLED for (int n = 0; n < N; n++) vec(c + m * c_row + n * LANES) = sum[m][n];
 }
 
-template <int N>
+// Rows of a panel of N vectors, M at a time while there are as many, then fewer.
+template <int M, int N>
 static void panel(int64_t rows, int64_t depth, Matrix a, const float *b, int64_t b_row, const float *bias, bool add,
                   float *c, int64_t c_row) {
-    for (; rows > 0; rows -= TILE, a.at += TILE * a.row, c += TILE * c_row) {
-        switch (std::min<int64_t>(TILE, rows)) {
-            case 6: tile<6, N>(depth, a, b, b_row, bias, add, c, c_row); break;
-            case 5: tile<5, N>(depth, a, b, b_row, bias, add, c, c_row); break;
-            case 4: tile<4, N>(depth, a, b, b_row, bias, add, c, c_row); break;
-            case 3: tile<3, N>(depth, a, b, b_row, bias, add, c, c_row); break;
-            case 2: tile<2, N>(depth, a, b, b_row, bias, add, c, c_row); break;
-            default: tile<1, N>(depth, a, b, b_row, bias, add, c, c_row);
-        }
-    }
+    for (; rows >= M; rows -= M, a.at += M * a.row, c += M * c_row)
+        tile<M, N>(depth, a, b, b_row, bias, add, c, c_row);
+    if constexpr (M > 1)
+        if (rows > 0) panel<M - (M + 2) / 3, N>(rows, depth, a, b, b_row, bias, add, c, c_row);
 }
 
 // c [rows, columns] = a b, plus a bias or plus c; columns is a multiple of PAD.
 static inline void product(int64_t rows, int64_t columns, int64_t depth, Matrix a, const float *b, int64_t b_row,
                     const float *bias, bool add, float *c, int64_t c_row) {
     int64_t n = 0;
-    for (; n + VECTORS * LANES <= columns; n += VECTORS * LANES)
-        panel<VECTORS>(rows, depth, a, b + n, b_row, bias ? bias + n : nullptr, add, c + n, c_row);
-    for (; n < columns; n += LANES)
-        panel<1>(rows, depth, a, b + n, b_row, bias ? bias + n : nullptr, add, c + n, c_row);
+    auto across = [&](auto panel, int64_t width) {
+        for (; n + width <= columns; n += width)
+            panel(rows, depth, a, b + n, b_row, bias ? bias + n : nullptr, add, c + n, c_row);
+    };
+    across(panel<TILE, VECTORS>, VECTORS * LANES);
+    if (VECTORS > 2) across(panel<2 * TILE, 2>, 2 * LANES);
+    across(panel<2 * TILE, 1>, LANES);
 }
 
-// Copy a matrix [rows, columns]: row by row where both sides lie so, else a few rows at a time, so that both go through
-// memory in whole lines.
+// Copy a matrix [rows, columns]: row by row where both sides lie so and rows are long, else a few rows at a time, so that
+// both go through memory in whole lines.
 static inline void copy(int64_t rows, int64_t columns, Matrix from, float *to, int64_t to_row, int64_t to_column) {
-    bool in_rows = from.column == 1 && to_column == 1;
+    bool in_rows = from.column == 1 && to_column == 1 && columns >= PAD;
     for (int64_t begin = 0; begin < rows; begin += in_rows ? 1 : PAD) {
         int64_t end = std::min(rows, begin + PAD);
         const float *row = from.at + begin * from.row;
