@@ -48,6 +48,7 @@ def export(
             "--episodes",
             "-e",
             min=2,
+            max=1_000_000,
             help="Per seed, to find the best; as many others evaluate a bundled policy.",
             show_default=str(EPISODES),
         ),

@@ -38,7 +38,7 @@ FIRST_TRIAL_SEED = 1000  # seed of the first trial; the best settings are evalua
 )
 def tune(
     choices: StudyChoices,
-    budget: Annotated[int, typer.Option("--budget", min=1, help="Trials, for each prior.")] = 30,
+    budget: Annotated[int, typer.Option("--budget", min=1, max=100_000, help="Trials, for each prior.")] = 30,
     space: Annotated[
         Path | None,
         typer.Option("--space", help="What to try, as JSON or TOML; by default a space for each algorithm."),

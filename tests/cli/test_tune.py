@@ -39,6 +39,7 @@ def test_a_dry_run_states_the_cost_of_equal_budgets_and_makes_nothing(command: l
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
+        (["--budget", "1" + "0" * 309], "--budget"),
         (["--task", "formation"], "esp tune takes one --task, not 2; run it once for each"),
         (["--algo", "mappo,qmix"], "esp tune takes one --algo, not 2"),
         (["--prior", "magic"], "--prior names each kind once; they are none, esp, auto, augment, consistency"),
