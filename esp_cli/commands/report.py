@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -52,16 +51,8 @@ def report(
     threshold: Annotated[
         list[float] | None, typer.Option("--threshold", help="State when this return is first reached.")
     ] = None,
-    reference: Annotated[
-        list[str] | None,
-        typer.Option("--reference", help="Runs: draw a line at a published number.", metavar="NAME=VALUE"),
-    ] = None,
     mode: Annotated[
         Mode | None, typer.Option("--mode", help="Which evaluations; greedy, unless the study is about others.")
-    ] = None,
-    y_limits: Annotated[
-        tuple[float, float] | None,
-        typer.Option("--y-limits", help="Runs: lowest and highest return in the picture.", metavar="LOW HIGH"),
     ] = None,
     plot: Annotated[Path | None, typer.Option("--plot", help="Draw the curves as PNG and SVG.")] = None,
     csv: Annotated[
@@ -81,25 +72,17 @@ def report(
     from esp_cli.studies.study import StudyFolder
 
     options.register_named(task, algo, network)
-    limits, lines = threshold or [], _references(reference or [])
+    limits = threshold or []
     options.check_finite("--threshold", *limits)
-    options.check_finite("--y-limits", *(y_limits or ()))
-    if y_limits is not None and y_limits[0] >= y_limits[1]:
-        low, high = y_limits
-        raise UserError(f"--y-limits {low:g} {high:g} is empty; write the lowest return before the highest")
     _refuse_tuning(runs[0])
     if StudyFolder.is_one(Path(runs[0])):
-        if len(runs) > 1 or at or reference or plot or y_limits:
-            raise UserError(
-                "a study is reported by itself: leave out the other runs, --at, --reference, --plot, --y-limits"
-            )
+        if len(runs) > 1 or at or plot:
+            raise UserError("a study is reported by itself: leave out the other runs, --at and --plot")
         out = out or Path(runs[0]) / "report"
         material = collect_study(StudyFolder.open(Path(runs[0])), mode, limits)
     else:
         if films and out is None:
             raise UserError("--films draws for the page that --out writes; add --out FOLDER, or leave it out")
-        if plot is None and (reference or y_limits):
-            raise UserError("--reference and --y-limits are of the picture that --plot draws; add --plot FILE")
         material = _side_by_side(runs, at or [], limits, mode, out)
 
     if csv is not None:
@@ -113,7 +96,7 @@ def report(
     if plot is not None:
         from esp_cli.reporting.study_figures import draw_curves
 
-        picture, _ = draw_curves(material, plot, lines, y_limits)
+        picture, _ = draw_curves(material, plot)
         for file in (picture.png, picture.svg):
             console.note(f"curves -> {file}")
     console.result(json, material.results.document(statistics=True), lambda: print_answer(material, full))
@@ -182,16 +165,3 @@ def _labelled(text: str) -> tuple[str | None, Path]:
     if Path(text).exists() or not splits:
         return None, Path(text)
     return next((split for split in splits if split[1].exists()), splits[-1])
-
-
-def _references(items: Sequence[str]) -> dict[str, float]:
-    out = {}
-    for item in items:
-        name, _, value = item.rpartition("=")
-        try:
-            out[name] = float(value)
-        except ValueError:
-            name = ""
-        if not name or not math.isfinite(out[name]):
-            raise UserError(f"--reference {item} is no line to draw; write --reference NAME=VALUE")
-    return out

@@ -1,4 +1,4 @@
-"""What a report writes: Markdown with pictures, one page that needs nothing but a browser, CSV, and for marl-eval."""
+"""What a report writes: Markdown with pictures, one page that needs nothing but a browser, and CSV."""
 
 from __future__ import annotations
 
@@ -36,21 +36,18 @@ from esp_cli.training.folder_names import POLICY
 from esp_cli.training.metrics import read_metrics
 from esp_cli.training.run_folder import RunFolder
 from esp_envs.errors import UserError
-from esp_envs.registry import task_class
 
-PAGE, MARKDOWN, RESULTS, MARL_EVAL, FILM = "report.html", "report.md", "results.json", "marl-eval.json", "film.gif"
+PAGE, MARKDOWN, RESULTS, FILM = "report.html", "report.md", "results.json", "film.gif"
 CURVES = "curves"
 _TEMPLATES = Path(__file__).with_name("templates")
 _FILM_PIXELS, _FILM_FRAMES_PER_SECOND = 240, 12.0
 _FILM_SECONDS = 15.0  # a film is sped up to last no longer
 _MAX_FILM_BYTES = 2**26
 _KEYS = ("run", "seed", "step")
-SeedRun = dict[str, dict[str, int | list[float]]]  # step, or "absolute_metrics" -> metric -> numbers
-MarlEval = dict[str, dict[str, dict[str, dict[str, SeedRun]]]]  # environment -> task -> algorithm -> seed
 
 
 def write_report(material: Material, out: Path) -> list[Path]:
-    """Write a report into a folder; return its files: page, Markdown, pictures, results and the form for marl-eval."""
+    """Write a report into a folder; return its files: page, Markdown, pictures and results."""
     if not material.curves:
         raise UserError("no run of this study has an evaluation yet; run it first, or wait a little")
     _refuse_foreign(out)
@@ -97,11 +94,10 @@ def write_report(material: Material, out: Path) -> list[Path]:
         PAGE: escaped(templates.get_template("report.html").render(content)).encode(),
         MARKDOWN: (escaped("\n\n".join(markdown)) + "\n").encode(),
         RESULTS: encode(material.results.document(), out / RESULTS),
-        MARL_EVAL: encode(marl_eval(material), out / MARL_EVAL),
     }
     for name, text in files.items():
         replace_file(out / name, text)
-    return [out / name for name in (PAGE, MARKDOWN, *(f"{stem}.png" for stem in names), RESULTS, MARL_EVAL)]
+    return [out / name for name in (PAGE, MARKDOWN, *(f"{stem}.png" for stem in names), RESULTS)]
 
 
 def draw_films(runs: Mapping[str, Path], watch: Callable[[int], None]) -> None:
@@ -130,37 +126,9 @@ def write_csv(path: Path, material: Material) -> int:
     return len(rows)
 
 
-def marl_eval(material: Material) -> MarlEval:
-    """Return the finished runs of a study in the form of marl-eval's README; it has no place for stopped seeds.
-
-    Environment -> task -> algorithm -> seed -> step -> metric. The tool wants as many evaluations of every task of an
-    environment, so the runs of one number of steps are an environment of their own. Each list holds one number, the
-    mean over episodes; `absolute_metrics` are those of the final evaluation of the trained policy.
-    """
-    out: MarlEval = {}
-    results = {entry.name: entry for entry in material.results.cells}
-    for cell in material.study.cells:
-        curve, finals = material.curves.get(cell.name), results[cell.name].returns.get(material.results.mode, ())
-        whole = [value for value in finals if value is not None]
-        if curve is None or not whole or len(whole) < len(finals) or not np.isfinite(curve.values).all():
-            continue
-        runs: dict[str, SeedRun] = {}
-        for k, seed in enumerate(cell.config.seeds):
-            evaluations = enumerate(zip(curve.steps, curve.values[:, k], strict=True), start=1)
-            own: SeedRun = {
-                f"step_{n}": {"step_count": int(step), "return": [float(value)]} for n, (step, value) in evaluations
-            }
-            runs[f"seed_{seed}"] = {**own, "absolute_metrics": {"return": [float(whole[k])]}}
-        package, *inner = task_class(cell.config.task).__module__.split(".")
-        family = inner[0] if package == "esp_envs" and inner else package
-        environment = out.setdefault(f"{family}_{format_count(cell.config.steps)}", {})
-        environment.setdefault(_key(cell.panel), {})[_key(cell.variant)] = runs
-    return out
-
-
 def _refuse_foreign(out: Path) -> None:
     """Refuse a folder whose files of these names are not of a report."""
-    own = (MARKDOWN, RESULTS, PAGE, MARL_EVAL, f"{CURVES}.png", f"{CURVES}.svg")
+    own = (MARKDOWN, RESULTS, PAGE, f"{CURVES}.png", f"{CURVES}.svg")
     foreign = next((out / name for name in own if os.path.lexists(out / name)), None)
     if foreign is not None and not RESULTS_FORMAT.is_one(out / RESULTS):
         raise UserError(f"{foreign} is not of a report by esp; move it away, or write the report to another folder")
@@ -197,10 +165,6 @@ def _rows(name: str, folder: Path) -> Iterable[dict[str, Any]]:
                 for key, value in row.items()
             }
             yield {**own, "run": name, "seed": seed}
-
-
-def _key(text: str) -> str:
-    return "_".join(text.replace(",", " ").replace("=", " ").split())
 
 
 _VERDICTS: dict[Side, str] = {"ahead": "is better than", "behind": "is worse than", "level": "is not told apart from"}

@@ -56,12 +56,7 @@ def series_of(results: Results) -> list[Series]:
     return [Series(name, setting, cells) for (name, setting), cells in whole.items()]
 
 
-def draw_curves(
-    material: Material,
-    path: Path,
-    references: Mapping[str, float] | None = None,
-    view: tuple[float, float] | None = None,
-) -> tuple[Picture, tuple[Hover, ...]]:
+def draw_curves(material: Material, path: Path) -> tuple[Picture, tuple[Hover, ...]]:
     """Draw the learning curves by panel, with the anchors of a run that has its final evaluation."""
     entries = {entry.name: entry for entry in material.results.cells}
     panels: dict[tuple[int, ...], Panel] = {}
@@ -75,10 +70,10 @@ def draw_curves(
         if drawn:
             title = cells[0].config.task if entries[cells[0].name].at is not None else name
             title = title.rpartition(":")[2]  # of a task of the caller, the class
-            panels.setdefault(tuple(map(id, drawn)), Panel(title, drawn, anchors, references or {}))
+            panels.setdefault(tuple(map(id, drawn)), Panel(title, drawn, anchors))
     conventions = {entry.convention for entry in entries.values() if entry.convention}
     convention = f" ({conventions.pop()})" if len(conventions) == 1 and len(panels) == 1 else ""
-    return learning_curves([*panels.values()], path, f"{material.results.mode} return{convention}", view)
+    return learning_curves([*panels.values()], path, f"{material.results.mode} return{convention}")
 
 
 def draw_variants(results: Results, out: Path) -> list[Picture]:
@@ -128,8 +123,6 @@ class Panel:
     title: str  # heading, such as "navigation, 500k"
     curves: Sequence[RunCurve]  # in the order of their colours; the same label has the same colour in every panel
     anchors: Mapping[str, float] = field(default_factory=dict)  # dotted lines where they are in view: name -> value
-    # dashed lines that are always in view, as of a paper: name -> value
-    references: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -142,7 +135,7 @@ class Hover:
 
 
 def learning_curves(
-    panels: Sequence[Panel], path: str | os.PathLike[str], ylabel: str, view: tuple[float, float] | None = None
+    panels: Sequence[Panel], path: str | os.PathLike[str], ylabel: str
 ) -> tuple[Picture, tuple[Hover, ...]]:
     """Draw means over seeds with their 95 % bootstrap intervals, in panels with one legend, as in the paper's figure 4.
 
@@ -159,7 +152,7 @@ def learning_curves(
         for axes, panel in zip(grid.flat, panels, strict=False):
             bands = [_draw_curve(axes, curve, labels.index(curve.label)) for curve in panel.curves]
             drawn.append((axes, panel, bands))
-            _draw_levels(axes, panel, view)
+            _draw_levels(axes, panel)
             axes.set_title(panel.title, loc="left", fontweight="bold")
             axes.set_xlabel("environment steps per seed")
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -200,26 +193,22 @@ def _draw_curve(axes: Axes, curve: RunCurve, index: int) -> Floats:
     return np.stack([steps, mean, low, high], axis=1)
 
 
-def _draw_levels(axes: Axes, panel: Panel, view: tuple[float, float] | None) -> None:
+def _draw_levels(axes: Axes, panel: Panel) -> None:
     """Draw the horizontal lines in view with their names; names that would lie upon each other stand in a row."""
-    for value in panel.references.values():
-        axes.axhline(value, linestyle=(0, (8, 4)), color="#333333", linewidth=1.0, zorder=1)
-    low, high = view or axes.get_ylim()
+    low, high = axes.get_ylim()
     random = panel.anchors.get("random", low)
-    if view is None and random < high:
+    if random < high:
         low = max(low, random - _BELOW_RANDOM * (high - random))
     axes.set_ylim(low, high)
-    levels = [(value, name) for name, value in panel.anchors.items()]
-    levels += [(value, f"{name} {value:g}") for name, value in panel.references.items()]
+    levels = [(value, name) for name, value in panel.anchors.items() if low <= value <= high]
     names: list[tuple[float, str]] = []
-    for value, name in sorted(level for level in levels if low <= level[0] <= high):
+    for value, name in sorted(levels):
         beside = names and value - names[-1][0] < _NAME_HEIGHT * (high - low)
         names.append((value, f"{names.pop()[1]}, {name}" if beside else name))
     for value, name in names:
         axes.annotate(name, (1.0, value), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=7)
-    for value in panel.anchors.values():
-        if low <= value <= high:
-            axes.axhline(value, linestyle=":", color="#777777", linewidth=1.0, zorder=1)
+    for value, _ in levels:
+        axes.axhline(value, linestyle=":", color="#777777", linewidth=1.0, zorder=1)
 
 
 def _hover(figure: Figure, axes: Axes, panel: Panel, labels: Sequence[str], bands: Sequence[Floats]) -> Hover:

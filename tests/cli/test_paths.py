@@ -99,8 +99,6 @@ def test_a_run_a_study_or_a_policy_that_cannot_be_there_is_one_sentence(
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (("--y-limits", "5", "1"), "--y-limits 5 1 is empty; write the lowest return before the highest"),
-        (("--y-limits", "nan", "1"), "--y-limits nan is not a finite number"),
         (("--threshold", "nan"), "--threshold nan is not a finite number"),
         (("--threshold", "inf"), "--threshold inf is not a finite number"),
         (("--at", "1e30"), "more than the 1e+12 steps that can be asked for"),

@@ -47,19 +47,7 @@ def cells(line: str) -> list[str]:
 
 def test_two_runs_are_held_against_each_other(finished: Path, plain: Path, tmp_path: Path) -> None:
     file, picture = tmp_path / "report.json", tmp_path / "curves.png"
-    options = [
-        "--full",
-        "--at",
-        "100",
-        "--at",
-        "150",
-        "--threshold",
-        "-1000",
-        "--threshold",
-        "-0.5",
-        "--reference",
-        "paper=-110",
-    ]
+    options = ["--full", "--at", "100", "--at", "150", "--threshold", "-1000", "--threshold", "-0.5"]
     told = esp("report", plain, f"ESP={finished}", *options, "--json", file, "--plot", picture)
     result = json.loads(file.read_text())
     assert (result["format"], result["kind"], result["config"]["task"]) == ("esp-results", "runs", "navigation")
@@ -97,7 +85,7 @@ def test_two_runs_are_held_against_each_other(finished: Path, plain: Path, tmp_p
     with Image.open(picture) as image:
         assert image.format == "PNG"
     drawing = picture.with_suffix(".svg").read_text()
-    assert all(text in drawing for text in ("<svg", "ESP", "plain", "paper"))
+    assert all(text in drawing for text in ("<svg", "ESP", "plain"))
     assert f"curves -> {picture}" in told.stderr
 
 
@@ -157,8 +145,6 @@ def test_one_seed_and_a_step_not_reached_are_dashes(tmp_path: Path, finished: Pa
 
 
 def test_options_of_what_is_not_written_are_refused(finished: Path) -> None:
-    for option in (("--reference", "paper=1"), ("--y-limits", "-200", "-100")):
-        assert "are of the picture that --plot draws" in refused("report", finished, *option)
     assert "add --out FOLDER" in refused("report", finished, "--films")
 
 
@@ -180,9 +166,6 @@ def test_runs_of_different_tasks_do_not_compare(finished: Path, tmp_path: Path) 
     ("options", "sentence"),
     [
         (["--at", "soon"], "'soon' is not a number of steps"),
-        (["--reference", "paper"], "--reference paper is no line to draw"),
-        (["--reference", "-110"], "--reference -110 is no line to draw"),
-        (["--reference", "paper=nan"], "--reference paper=nan is no line to draw"),
         (["--threshold", "high"], "--threshold"),
         (["--mode", "best"], "'best' is not one of 'greedy', 'stochastic'"),
     ],

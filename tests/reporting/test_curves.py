@@ -171,13 +171,13 @@ def test_a_run_of_a_gpu_is_compared_where_there_is_none():
     assert compare([there, curve(ESP)], [100], [])["run 1"][100]["summary"]["gap"]["difference"]["value"] == 2.0
 
 
-def test_the_picture_shows_the_curves_and_somebody_elses_number(tmp_path):
+def test_the_picture_shows_the_curves(tmp_path):
     curves = [curve(PLAIN, "plain"), curve(ESP, "ESP")]
-    picture, _ = draw_curves(gathered(curves, [100, 200]), tmp_path / "curves.png", {"the paper": -2.5})
+    picture, _ = draw_curves(gathered(curves, [100, 200]), tmp_path / "curves.png")
     with Image.open(picture.png) as image:
         assert image.format == "PNG"
     text = picture.svg.read_text()
-    assert all(part in text for part in ("plain", "ESP", "the paper", "greedy return (esp: team sum", "navigation"))
+    assert all(part in text for part in ("plain", "ESP", "greedy return (esp: team sum", "navigation"))
     assert text.count("<!-- plain") == 1, "one curve, whatever the number of steps"
 
 

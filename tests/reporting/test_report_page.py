@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 import subprocess
@@ -15,7 +14,7 @@ from PIL import Image
 
 from esp_cli.drawing.films import write_gif
 from esp_cli.reporting.collect import Material, collect_study
-from esp_cli.reporting.page import marl_eval, write_report
+from esp_cli.reporting.page import write_report
 from esp_cli.reporting.tables import Table, markdown_text
 from tests.studies.small_studies import small_study, write_study
 
@@ -62,7 +61,7 @@ def page(tmp_path_factory) -> Path:
     frames = [np.full((16, 16, 3), shade, np.uint8) for shade in (0, 255)]
     write_gif(made.runs[made.study.cells[1].name] / "film.gif", frames, [0.5, 0.5], frames)
     files = write_report(made, path / "report")
-    assert [file.name for file in files] == ["report.html", "report.md", "curves.png", "results.json", "marl-eval.json"]
+    assert [file.name for file in files] == ["report.html", "report.md", "curves.png", "results.json"]
     return files[0]
 
 
@@ -206,29 +205,3 @@ def test_a_screenshot_has_the_colours_of_the_curves(page, tmp_path):
     with Image.open(picture) as image:
         colours = {colour for _, colour in image.convert("RGB").getcolors(2**24)}
     assert {(0x00, 0x72, 0xB2), (0xD5, 0x5E, 0x00)} <= colours
-
-
-def exported(path, study, ends):
-    return marl_eval(collect_study(write_study(path, study, ends)))
-
-
-def test_environment_task_algorithm_run_step_and_metric(tmp_path):
-    study = small_study(tasks=("navigation", "predator-prey"))
-    found = exported(tmp_path / "s", study, {"MAPPO": [-1.0, -2.0, -3.0], "MAPPO-ESP": [0.0, 1.0, 2.0]})
-    assert list(found) == ["mpe_200"]
-    assert list(found["mpe_200"]) == ["navigation_200", "predator-prey_200"]
-    assert list(found["mpe_200"]["navigation_200"]) == ["MAPPO", "MAPPO-ESP"]
-    runs = found["mpe_200"]["navigation_200"]["MAPPO-ESP"]
-    assert list(runs) == ["seed_0", "seed_1", "seed_2"]
-    assert runs["seed_1"] == {
-        "step_1": {"step_count": 0, "return": [-39.0]},
-        "step_2": {"step_count": 100, "return": [-19.0]},
-        "step_3": {"step_count": 200, "return": [1.0]},
-        "absolute_metrics": {"return": [1.0]},
-    }
-    assert json.loads(json.dumps(found, allow_nan=False)) == found
-
-
-def test_runs_without_an_end_and_stopped_seeds_have_no_place_there(tmp_path):
-    found = exported(tmp_path / "s", small_study(), {"MAPPO": [-1.0, None, -3.0]})
-    assert found == {}
