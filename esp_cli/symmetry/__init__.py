@@ -1,7 +1,6 @@
-"""The mathematics of symmetry: groups, their representations on a task's spaces, and numeric checks."""
+"""The mathematics of symmetry: groups, and their representations on a task's spaces."""
 
 from esp_cli.symmetry.admission import admit, admit_declared, carried_groups, default_transforms
-from esp_cli.symmetry.checks import environment_errors, network_equivariance_error
 from esp_cli.symmetry.elements import Element, Geometry
 from esp_cli.symmetry.groups import FiniteGroup, Group, agent_permutations, direct_product, item_orders
 from esp_cli.symmetry.parse import parse_elements, parse_group
@@ -25,10 +24,8 @@ __all__ = [
     "default_transforms",
     "dihedral",
     "direct_product",
-    "environment_errors",
     "item_orders",
     "mirror",
-    "network_equivariance_error",
     "orthogonal",
     "parse_elements",
     "parse_group",

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from esp_cli.symmetry import build_transform, environment_errors, parse_elements
+from esp_cli.symmetry import build_transform, parse_elements
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
 from esp_envs import Environment, Field, Items, Kind, UserError, generators_for, layout, make, register
@@ -21,6 +21,7 @@ from tests.own_tasks import save_page_files
 vmas = pytest.importorskip("vmas", reason="VMAS comes with the extra 'vmas'")
 from esp_envs.adapters import vmas_scenarios  # noqa: E402
 from esp_envs.adapters.vmas import VmasTask  # noqa: E402
+from tests.symmetry.checks import environment_errors  # noqa: E402
 
 CASES = [
     ("Navigation", {}),

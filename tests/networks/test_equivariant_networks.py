@@ -12,13 +12,14 @@ from esp_cli.networks.contract import IoSpec
 from esp_cli.networks.layers import SeedMLP, orthogonal
 from esp_cli.networks.message_passing import MessagePassing, PictureEncoder, distinct
 from esp_cli.networks.symmetrised import Symmetrised
-from esp_cli.symmetry import PlaneElement, cyclic, dihedral, network_equivariance_error, parse_group, transform_set
+from esp_cli.symmetry import PlaneElement, cyclic, dihedral, parse_group, transform_set
 from esp_cli.symmetry.maps import Block, layout_blocks, regular, trivial
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
 from esp_envs import make
 from esp_envs.spec import Field, Kind, TaskSpec
 from tests.networks.gradients import assert_same_gradients
+from tests.symmetry.checks import network_equivariance_error
 
 SEEDS, WORLDS = 2, 12
 EXACT = 1e-5

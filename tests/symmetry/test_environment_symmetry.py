@@ -21,13 +21,13 @@ from esp_cli.symmetry import (
     build_transform,
     carried_groups,
     dihedral,
-    environment_errors,
     mirror,
     parse_elements,
     rotation,
     transform_set,
 )
 from esp_envs import Environment, Items, Layout, make
+from tests.symmetry.checks import environment_errors
 
 WORLDS, STEPS = 24, 6
 D4, D8 = dihedral(4).elements[1:], dihedral(8).elements[1:]

@@ -16,7 +16,6 @@ from esp_cli.symmetry import (
     build_transform,
     carried_groups,
     dihedral,
-    environment_errors,
     mirror,
     parse_elements,
     rotation,
@@ -25,6 +24,7 @@ from esp_cli.symmetry import (
 from esp_cli.symmetry.maps import Dense
 from esp_envs import Environment, make
 from esp_envs.epuck.engines import ENGINES
+from tests.symmetry.checks import environment_errors
 
 WORLDS = 6
 D4 = dihedral(4).elements[1:]

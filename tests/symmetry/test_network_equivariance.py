@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from esp_cli.symmetry import network_equivariance_error, transform_set
+from esp_cli.symmetry import transform_set
+from tests.symmetry.checks import network_equivariance_error
 from tests.symmetry.toy_actions import EVERYTHING
 
 SEEDS, WORLDS, HIDDEN = 2, 5, 16

@@ -13,7 +13,6 @@ from esp_cli.symmetry import (
     Transform,
     build_transform,
     carried_groups,
-    environment_errors,
     mirror,
     parse_elements,
     rotation,
@@ -21,6 +20,7 @@ from esp_cli.symmetry import (
 from esp_cli.symmetry.maps import Gather
 from esp_cli.symmetry.plane import PlaneElement, picture_sources
 from esp_envs import Environment, make
+from tests.symmetry.checks import environment_errors
 
 STEPS = 6
 
