@@ -74,10 +74,7 @@ class Step:
 
 
 def random_choice(allowed: Tensor, number: Tensor) -> Tensor:
-    """Return an allowed action, each equally likely, by numbers [...] uniform in [0, 1).
-
-    `allowed` is [..., A] bool; a row that allows nothing allows all.
-    """
+    """Return an action that a row of `allowed` [..., A] allows (one that allows none, all), by numbers in [0, 1)."""
     allowed = allowed | ~allowed.any(-1, keepdim=True)
     count = allowed.sum(-1)
     place = (number * count).long().minimum(count - 1)

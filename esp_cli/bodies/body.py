@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from esp_cli.bodies import kinds
-from esp_cli.bodies.asymmetry import Difference, differences
-from esp_cli.bodies.deriving import Match, derive
+from esp_cli.bodies.finding import Difference, Found, find
 from esp_cli.bodies.frame import Frame
 from esp_cli.bodies.parts import Parts, named_parts
-from esp_cli.bodies.proof import NEARLY, Proof, prove
+from esp_cli.bodies.proof import NEARLY
 from esp_cli.bodies.reading import MOST_BODIES, MOST_MOVING, printable, quiet, read_model
 from esp_cli.symmetry.elements import Floats
 from esp_cli.symmetry.parse import parse_elements
@@ -25,26 +22,6 @@ from esp_envs.spec import Field, Kind, Layout
 
 SECONDS = 50.0
 """Processor time within which the search of a model ends."""
-_TURNS = sorted({Fraction(k, n) for n in (2, 3, 4, 5, 6, 8) for k in range(1, n)})
-_AXES = sorted({Fraction(k, n) for n in (10, 16, 24) for k in range(n)})
-TRIED = tuple(
-    dict.fromkeys(
-        [PlaneElement(mirrored=True), PlaneElement(Fraction(1, 2), mirrored=True)]
-        + [PlaneElement(turn) for turn in _TURNS]
-        + [PlaneElement(turn, mirrored=True) for turn in _AXES]
-    )
-)
-"""The elements that a model is searched for: turns by 1/2 to 1/8, and mirrors in lines between which such turns lie."""
-
-
-@dataclass(frozen=True)
-class Found:
-    """What is known of one element of a model: its match, the proof, and what differs, by joint and of a free base."""
-
-    match: Match
-    proof: Proof
-    differences: list[Difference] = field(repr=False)
-    base: Difference | None = None
 
 
 class Body:
@@ -141,14 +118,7 @@ class Body:
                 f"{MOST_BODIES} bodies"
             )
         self, frame = cls([], {}), Frame(model, seconds)
-        idle: set[PlaneElement] = set()  # a mirror in the plane of a planar robot
-        found: dict[PlaneElement, Found] = {}
-        for element in TRIED:
-            if not any(element @ still in found for still in idle):
-                self._try(frame, element, tolerated, found, idle)
-        while lost := _outside(found, idle):
-            del found[lost]
-            self.refused[lost.name] = "its products with the other symmetries do not hold"
+        found, self.refused = find(frame, tolerated)
         self.found = {element.name: one for element, one in found.items()}
         matches = {element: one.match for element, one in found.items()}
         names = {frame.name("joint", j): j for j in range(model.njnt) if j != frame.base}
@@ -168,35 +138,6 @@ class Body:
             moves = self._positions.moves, self._velocities.moves
             self._base = Parts("base's", places, moves[0]), Parts("base's", rates, moves[1])
         return self
-
-    def _try(
-        self,
-        frame: Frame,
-        element: PlaneElement,
-        tolerated: float,
-        found: dict[PlaneElement, Found],
-        idle: set[PlaneElement],
-    ) -> None:
-        """Derive and prove one element, and keep it or the reason against it."""
-        try:
-            frame.stop_if_late()
-            match = derive(frame, element)
-            if match.is_trivial:
-                idle.add(element)
-                return
-            proof = prove(frame, match)
-        except UserError as error:
-            if element in TRIED[:2] or frame.is_late:
-                self.refused[element.name] = str(error)
-            return
-        if match.unmatched:
-            self.refused[element.name] = f"no image was found of the actuators {', '.join(match.unmatched)}"
-        elif not proof.gap <= tolerated:  # nor NaN
-            worst = printable(frame.name("joint", int(proof.joints.argmax())))
-            self.refused[element.name] = f"accelerations of {worst} differ by {proof.gap:.2g} of their size"
-        else:
-            differ = differences(frame, match)
-            found[element] = Found(match, proof, differ, None if frame.base is None else differ[frame.base])
 
     @property
     def group(self) -> str:
@@ -320,16 +261,3 @@ class Body:
                 raise UserError(
                     f"the pose is not its own image under {element.name}: {joint} is off by {off.max():.3g}"
                 )
-
-
-def _outside(found: Mapping[PlaneElement, Found], idle: set[PlaneElement]) -> PlaneElement | None:
-    """Return the last of two elements whose product is not among them, or does something else."""
-    for g, first in found.items():
-        for h, second in found.items():
-            product = found.get(g @ h)
-            if (g @ h).is_identity or g @ h in idle:
-                continue
-            made = first.match.qvel @ second.match.qvel
-            if product is None or not np.allclose(product.match.qvel, made, atol=1e-6):
-                return max(g, h, key=TRIED.index)
-    return None

@@ -14,8 +14,8 @@ from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
     from esp_cli.bodies import Body
-    from esp_cli.bodies.asymmetry import Difference
     from esp_cli.bodies.auditing import Copy
+    from esp_cli.bodies.finding import Difference
     from esp_cli.bodies.turning import Turning
 
 EPILOG = """Examples:\n

@@ -93,12 +93,11 @@ class TrainedPolicy:
         }
         if part := next((part for part, other in differs.items() if other), None):
             names = ", ".join(f"task.{name}" for name in settings)
-            known = (
-                numbers and not free and "; the weights of its network are made for a number of agents, of set for any"
-            )
+            made = numbers and not free
+            known = "; the weights of its network are made for a number of agents, of set for any" if made else ""
             raise UserError(
                 f"{self.source} was trained with other {part} than the task has with {names} "
-                f"changed; change only what a policy neither sees nor does{known or ''}"
+                f"changed; change only what a policy neither sees nor does{known}"
             )
         if spec.observation == self.spec.observation and not numbers:
             return replace(self, config=config, spec=spec)
@@ -164,11 +163,7 @@ def open_policy(where: Path, algo: str | None = None, prior: str | None = None) 
 
 def load_entry(entry: bundled.Entry) -> TrainedPolicy:
     """Load a bundled policy; raises a UserError where its file is missing, or another than the manifest names."""
-    trained = TrainedPolicy.read(bundled.bundled_folder() / entry.file, entry.sha256)
-    described = (trained.config.task, trained.config.algorithm, trained.config.prior.kind, trained.config.seeds)
-    if described != (entry.task, entry.algorithm, entry.prior, (entry.seed,)):
-        raise UserError(f"{trained.source} does not hold the policy that its manifest describes; get both again")
-    return trained
+    return TrainedPolicy.read(bundled.bundled_folder() / entry.file, entry.sha256)
 
 
 @dataclass(frozen=True)
@@ -300,7 +295,6 @@ def _fill(policy: Policy, tensors: dict[str, Tensor], path: Path, misfit: str) -
     try:
         policy.load_state_dict(tensors)
     except RuntimeError as error:
-        reason = str(error).strip().splitlines()[-1].strip()
-        raise UserError(f"{misfit} ({reason})") from None
+        raise UserError(f"{misfit} ({str(error).strip().splitlines()[-1].strip()})") from None
     if not all(bool(tensor.isfinite().all()) for tensor in tensors.values()):
         raise UserError(f"{path} holds weights that are not finite; use another copy of it, or train again")

@@ -199,7 +199,7 @@ def test_unnamed_joints_are_numbered_and_accelerations_that_are_no_numbers_prove
     frame = Frame(mujoco.MjModel.from_xml_string(biped()))
     broken = replace(prove(frame, derive(frame, LEFT_RIGHT)), joints=np.full(10, np.nan))
     assert broken.verdict == "broken"
-    monkeypatch.setattr("esp_cli.bodies.body.prove", lambda frame, match: broken)
+    monkeypatch.setattr("esp_cli.bodies.finding.prove", lambda frame, match: broken)
     assert body_of(biped()).group == "c1"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from esp_envs.errors import UserError
 from esp_envs.installed import last_line
+from esp_envs.spec import Continuous, Kind
 
 PARALLEL, SINGLE = "a PettingZoo ParallelEnv", "a Gymnasium environment"
 _AEC, _VECTOR = "a PettingZoo AEC environment, whose agents act in turn", "a vector of environments"
@@ -25,6 +27,8 @@ _PARTS = {
     "reset": ("observations", "infos"),
     "step": ("observations", "rewards", "terminated", "truncated", "infos"),
 }
+_TURNS, _MIRRORS, _HALF = r"(o2|so2|[cd](?!1\b)\d+)", r"(o2|d\d|flip)", ("c2", "d2")
+"""Symmetries of the scene that turn a vector, that mirror it, and that turn it by a half at most."""
 EVERYONE = "__all__"  # the entry of a mapping of flags that speaks of all agents
 
 
@@ -173,3 +177,28 @@ def naming(place: str, what: str) -> Iterator[None]:
         raise
     except (Exception, SystemExit) as error:  # an environment that calls sys.exit ends no run with code 0
         raise UserError(f"{place} raises in '{what}': {last_line(error)}") from error
+
+
+def require_round(action: Continuous, symmetry: str, name: Any, box: tuple[NDArray[Any], NDArray[Any]]) -> None:
+    """Refuse bounds that break the declared symmetry: a turn needs equal ones around 0, a mirror some around 0."""
+    turns, mirrors = (re.match(pattern, symmetry) for pattern in (_TURNS, _MIRRORS))
+    low, high = box
+    for field, where in zip(action.layout.fields, action.layout.slices().values(), strict=True):
+        centred = np.allclose(low[where], -high[where])
+        equal = centred and (np.ptp(high[where]) == 0 or (turns is not None and turns[0] in _HALF))
+        bent = field.kind.is_vector and turns and not equal
+        if bent or (field.kind is Kind.PSEUDOSCALAR and mirrors and not centred):
+            raise UserError(
+                f"{name} acts by '{field.name}', a {field.kind.name}, between {low[where].tolist()} and "
+                f"{high[where].tolist()}, which '{symmetry}' does not leave alone; declare a smaller symmetry, or "
+                "give bounds that are equal on all sides"
+            )
+
+
+def bounds_of(space: Any) -> tuple[NDArray[Any], NDArray[Any]] | None:
+    """Return the bounds of a finite Box of real numbers, None for any other space."""
+    if not hasattr(space, "low") or space.dtype.kind != "f":
+        return None
+    with np.errstate(over="ignore", invalid="ignore"):
+        is_finite = np.isfinite(space.high - space.low).all()  # bounds of the largest numbers are none
+    return (np.asarray(space.low), np.asarray(space.high)) if is_finite else None

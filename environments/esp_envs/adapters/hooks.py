@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
@@ -15,11 +14,9 @@ from esp_envs.adapters import foreign
 from esp_envs.adapters.pairing import Attributes, Simulator
 from esp_envs.errors import UserError
 from esp_envs.roles import of_role
-from esp_envs.spec import ActionSpace, Continuous, Discrete, Kind, Layout
+from esp_envs.spec import ActionSpace, Discrete, Layout
 
 Array = NDArray[Any]
-_TURNS, _MIRRORS, _HALF = r"(o2|so2|[cd](?!1\b)\d+)", r"(o2|d\d|flip)", ("c2", "d2")
-"""Symmetries of the scene that turn a vector, that mirror it, and that turn it by a half at most."""
 
 
 class CopyHooks(ABC):
@@ -172,7 +169,7 @@ class Copy:
         self.simulator = Simulator(self.env, groups or {"": self.learners}, task.attributes)
         self._width = max(task.layout_of(name).width for name in self.learners)
         spaces = [foreign.space_of(self.env, name) for name in self.learners]
-        self._boxes = [_bounds(space) for space in spaces]
+        self._boxes = [foreign.bounds_of(space) for space in spaces]
         starts = [getattr(space, "start", 0) for space in spaces]
         self._starts = [int(start) if np.ndim(start) == 0 else 0 for start in starts]
 
@@ -218,15 +215,15 @@ class Copy:
                 if size != action.count:
                     raise UserError(f"{name} has a mask of {size} actions, but the task has {action.count}")
             space = foreign.space_of(self.env, name)
-            if type(task).acting is not CopyHooks.acting and _bounds(space) is None:
+            if type(task).acting is not CopyHooks.acting and foreign.bounds_of(space) is None:
                 continue  # it makes of the layout's actions what the space holds
             if isinstance(action, Discrete):
                 if getattr(space, "n", None) != action.count or space.shape != ():
                     raise UserError(f"{name} acts in {space}, but the task says {action.count} discrete actions")
-            elif (box := _bounds(space)) is None or space.shape != (action.width,):
+            elif (box := foreign.bounds_of(space)) is None or space.shape != (action.width,):
                 raise UserError(f"{name} acts in {space}, but the task says {action.width} bounded real numbers")
             else:
-                _require_round(action, task.symmetry, name, box)
+                foreign.require_round(action, task.symmetry, name, box)
         if task.state is not None and not callable(getattr(self.env, "state", None)):
             raise UserError("the task says what the state is, but its environment has no 'state' method")
         if task.state is not None and (got := self.state().size) != task.state.width:
@@ -284,30 +281,5 @@ class Copy:
             self.env.close()
 
 
-def _require_round(action: Continuous, symmetry: str, name: Any, box: tuple[Array, Array]) -> None:
-    """Refuse bounds that break the declared symmetry: a turn needs equal ones around 0, a mirror some around 0."""
-    turns, mirrors = (re.match(pattern, symmetry) for pattern in (_TURNS, _MIRRORS))
-    low, high = box
-    for field, where in zip(action.layout.fields, action.layout.slices().values(), strict=True):
-        centred = np.allclose(low[where], -high[where])
-        equal = centred and (np.ptp(high[where]) == 0 or (turns is not None and turns[0] in _HALF))
-        bent = field.kind.is_vector and turns and not equal
-        if bent or (field.kind is Kind.PSEUDOSCALAR and mirrors and not centred):
-            raise UserError(
-                f"{name} acts by '{field.name}', a {field.kind.name}, between {low[where].tolist()} and "
-                f"{high[where].tolist()}, which '{symmetry}' does not leave alone; declare a smaller symmetry, or "
-                "give bounds that are equal on all sides"
-            )
-
-
 def _has(place: Any, name: str) -> bool:
     return isinstance(place, Mapping) and name in place
-
-
-def _bounds(space: Any) -> tuple[Array, Array] | None:
-    """Return the bounds of a finite Box of real numbers, None for any other space."""
-    if not hasattr(space, "low") or space.dtype.kind != "f":
-        return None
-    with np.errstate(over="ignore", invalid="ignore"):
-        is_finite = np.isfinite(space.high - space.low).all()  # bounds of the largest numbers are none
-    return (np.asarray(space.low), np.asarray(space.high)) if is_finite else None

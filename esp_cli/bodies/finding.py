@@ -1,0 +1,149 @@
+"""Search a model for its symmetries, and say by joint which property differs most from that of its image."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from fractions import Fraction
+
+import mujoco
+import numpy as np
+
+from esp_cli.bodies.deriving import Match, derive
+from esp_cli.bodies.frame import HINGE, SLIDE, Frame, image_of_axis
+from esp_cli.bodies.proof import Proof, prove
+from esp_cli.bodies.reading import printable
+from esp_cli.symmetry.elements import Floats
+from esp_cli.symmetry.plane import PlaneElement
+from esp_envs.errors import UserError
+
+_TURNS = sorted({Fraction(k, n) for n in (2, 3, 4, 5, 6, 8) for k in range(1, n)})
+_AXES = sorted({Fraction(k, n) for n in (10, 16, 24) for k in range(n)})
+TRIED = tuple(
+    dict.fromkeys(
+        [PlaneElement(mirrored=True), PlaneElement(Fraction(1, 2), mirrored=True)]
+        + [PlaneElement(turn) for turn in _TURNS]
+        + [PlaneElement(turn, mirrored=True) for turn in _AXES]
+    )
+)
+"""The elements that a model is searched for: turns by 1/2 to 1/8, and mirrors in lines between which such turns lie."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """The property of a joint that differs most from that of its image.
+
+    Attributes:
+        what: "mass", "range", "gain", ...; empty where nothing differs.
+        share: the difference over the larger of the two; of places, over the robot's size.
+    """
+
+    what: str
+    share: float
+
+
+@dataclass(frozen=True)
+class Found:
+    """What is known of one element of a model: its match, the proof, and what differs, by joint and of a free base."""
+
+    match: Match
+    proof: Proof
+    differences: list[Difference] = field(repr=False)
+    base: Difference | None = None
+
+
+def find(frame: Frame, tolerated: float) -> tuple[dict[PlaneElement, Found], dict[str, str]]:
+    """Return the elements that a model has, and by name why others do not hold."""
+    idle: set[PlaneElement] = set()  # a mirror in the plane of a planar robot
+    found: dict[PlaneElement, Found] = {}
+    refused: dict[str, str] = {}
+    for element in TRIED:
+        if any(element @ still in found for still in idle):
+            continue
+        try:
+            frame.stop_if_late()
+            match = derive(frame, element)
+            if match.is_trivial:
+                idle.add(element)
+                continue
+            proof = prove(frame, match)
+        except UserError as error:
+            if element in TRIED[:2] or frame.is_late:
+                refused[element.name] = str(error)
+            continue
+        if match.unmatched:
+            refused[element.name] = f"no image was found of the actuators {', '.join(match.unmatched)}"
+        elif not proof.gap <= tolerated:  # nor NaN
+            worst = printable(frame.name("joint", int(proof.joints.argmax())))
+            refused[element.name] = f"accelerations of {worst} differ by {proof.gap:.2g} of their size"
+        else:
+            differ = differences(frame, match)
+            found[element] = Found(match, proof, differ, None if frame.base is None else differ[frame.base])
+    while lost := _outside(found, idle):
+        del found[lost]
+        refused[lost.name] = "its products with the other symmetries do not hold"
+    return found, refused
+
+
+def _outside(found: Mapping[PlaneElement, Found], idle: set[PlaneElement]) -> PlaneElement | None:
+    """Return the last of two elements whose product is not among them, or does something else."""
+    for g, first in found.items():
+        for h, second in found.items():
+            product = found.get(g @ h)
+            if (g @ h).is_identity or g @ h in idle:
+                continue
+            made = first.match.qvel @ second.match.qvel
+            if product is None or not np.allclose(product.match.qvel, made, atol=1e-6):
+                return max(g, h, key=TRIED.index)
+    return None
+
+
+def differences(frame: Frame, match: Match) -> list[Difference]:
+    """Return for each joint what differs most: 0 of a joint that is the exact image of its partner's."""
+    model, R = frame.model, frame.image(match.element)
+    found = []
+    for i, j in enumerate(match.joint.tolist()):
+        shares = _of_joint(frame, R, i, j)
+        for a in np.flatnonzero(model.actuator_trnid[:, 0] == i):
+            if model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT and match.ctrl[:, a].any():
+                shares |= _of_actuator(frame, match, int(a))
+        what, share = max(shares.items(), key=lambda item: item[1])
+        found.append(Difference(what if share > 1e-9 else "", share))
+    return found
+
+
+def _of_joint(frame: Frame, R: Floats, i: int, j: int) -> dict[str, float]:
+    model = frame.model
+    (b, c), (v, w) = model.jnt_bodyid[[i, j]], model.jnt_dofadr[[i, j]]
+    shares = {
+        "mass": _share(frame.mass[b], frame.mass[c]),
+        "middle of mass": float(np.linalg.norm(R @ frame.com[b] - frame.com[c]) / frame.size),
+        "inertia": _share(R @ frame.inertia[b] @ R.T, frame.inertia[c]),
+        "damping": _share(model.dof_damping[v], model.dof_damping[w]),
+        "armature": _share(model.dof_armature[v], model.dof_armature[w]),
+        "friction": _share(model.dof_frictionloss[v], model.dof_frictionloss[w]),
+        "stiffness": _share(model.jnt_stiffness[i], model.jnt_stiffness[j]),
+    }
+    if model.jnt_type[i] in (SLIDE, HINGE):
+        axis = image_of_axis(frame, R, i)
+        sign = np.copysign(1.0, axis @ frame.axis[j])
+        shares["axis"] = float(np.linalg.norm(axis - sign * frame.axis[j]))
+        limits = [model.jnt_range[k] * model.jnt_limited[k] - model.qpos0[frame.qpos_of(k)] for k in (i, j)]
+        shares["range"] = _share(np.sort(sign * limits[0]), limits[1])
+    return shares
+
+
+def _of_actuator(frame: Frame, match: Match, a: int) -> dict[str, float]:
+    model, b = frame.model, int(np.abs(match.ctrl[:, a]).argmax())
+    names = {"gain": "gainprm", "bias": "biasprm", "force range": "forcerange", "control range": "ctrlrange"}
+    values = {what: getattr(model, f"actuator_{name}")[[a, b]] for what, name in names.items()}
+    for what in ("force range", "control range"):
+        values[what] = [np.sort(match.ctrl[b, a] * values[what][0]), values[what][1]]
+    values["gear"] = np.abs(model.actuator_gear[[a, b]])
+    return {what: _share(*pair) for what, pair in values.items()}
+
+
+def _share(a: Floats | float, b: Floats | float) -> float:
+    """Return the largest difference of two numbers or arrays over the largest of their sizes."""
+    largest = max(np.abs(a).max(), np.abs(b).max())
+    return float(np.abs(np.subtract(a, b)).max() / largest) if largest > 1e-12 else 0.0
