@@ -27,7 +27,7 @@ FURTHER: dict[str, dict[str, str]] = {}
 _FOREIGN: set[str] = set()  # top-level modules of the classes that are registered or installed
 
 _ELSEWHERE = {"simple_spread": "navigation", "simple_tag": "predator-prey"}  # names of tasks in MPE
-_MODULE_AND_CLASS = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
+_MODULE_AND_NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 
 
 class Registry(Mapping[str, type[T]]):
@@ -62,7 +62,7 @@ class Registry(Mapping[str, type[T]]):
         if isinstance(given, str):
             if ":" not in given:
                 return given
-            name, cls = given, self._import(given)
+            name, cls = given, self._checked(import_named(given, self.noun, "Class", self.example), given)
         else:
             name, cls = f"{given.__module__}:{given.__qualname__}", self._checked(given, given.__qualname__)
         self._registered[name] = cls
@@ -81,7 +81,7 @@ class Registry(Mapping[str, type[T]]):
                 return self._checked(entry.load(), name)
             except (Exception, SystemExit) as error:
                 raise UserError(f"the installed {self.noun} '{name}' cannot be imported: {last_line(error)}") from error
-        if _MODULE_AND_CLASS.fullmatch(name):
+        if _MODULE_AND_NAME.fullmatch(name):
             raise UserError(
                 f"the {self.noun} '{name}' is not installed; add {self.option} {name} to let esp import and run it"
             )
@@ -106,30 +106,6 @@ class Registry(Mapping[str, type[T]]):
     def _installed(self) -> dict[str, EntryPoint]:
         return {entry.name: entry for entry in entries(self.group)}
 
-    def _import(self, name: str) -> type[T]:
-        if not _MODULE_AND_CLASS.fullmatch(name):
-            raise UserError(f"'{name[:80]}' names no {self.noun}; write module:Class, as in {self.example}")
-        module_name, class_name = name.split(":")
-        here = str(Path.cwd())
-        # first while the module is found, as for a script; last afterwards: no other import meets the user's files
-        sys.path.insert(0, here)
-        invalidate_caches()  # the user may have written the file a moment ago
-        try:
-            module = import_module(module_name)
-        except (Exception, SystemExit) as error:
-            missing = isinstance(error, ModuleNotFoundError) and module_name.startswith(error.name or "?")
-            place = f"; it is looked for in {here} and among installed packages, without .py" if missing else ""
-            raise UserError(
-                f"cannot import the module '{module_name}' of the {self.noun}: {last_line(error)}{place}"
-            ) from error
-        finally:
-            sys.path.remove(here)
-            if here not in sys.path:
-                sys.path.append(here)
-        if not hasattr(module, class_name):
-            raise UserError(f"the module '{module_name}' has no class '{class_name}'; check the name after the colon")
-        return self._checked(getattr(module, class_name), name)
-
     def _checked(self, cls: object, name: str) -> type[T]:
         base: type[T] = load(self._base)
         if not (isinstance(cls, type) and issubclass(cls, base)):
@@ -139,6 +115,35 @@ class Registry(Mapping[str, type[T]]):
             missing = ", ".join(sorted(vars(cls)["__abstractmethods__"]))
             raise UserError(f"the {self.noun} '{name}' lacks {missing}; implement what its base class leaves open")
         return cls
+
+
+def import_named(name: str, noun: str, kind: str, example: str) -> Any:
+    """Import what a user named as "module:Class" or "module:function", whichever the kind is; `noun` is what it is for.
+
+    The working directory is importable while the module is imported, as it is for a script.
+    """
+    if not _MODULE_AND_NAME.fullmatch(name):
+        raise UserError(f"'{name[:80]}' names no {noun}; write module:{kind}, as in {example}")
+    module_name, attribute = name.split(":")
+    here = str(Path.cwd())
+    # first while the module is found, as for a script; last afterwards: no other import meets the user's files
+    sys.path.insert(0, here)
+    invalidate_caches()  # the user may have written the file a moment ago
+    try:
+        module = import_module(module_name)
+    except (Exception, SystemExit) as error:
+        missing = isinstance(error, ModuleNotFoundError) and module_name.startswith(error.name or "?")
+        place = f"; it is looked for in {here} and among installed packages, without .py" if missing else ""
+        raise UserError(f"cannot import the module '{module_name}' of the {noun}: {last_line(error)}{place}") from error
+    finally:
+        sys.path.remove(here)
+        if here not in sys.path:
+            sys.path.append(here)
+    if not hasattr(module, attribute):
+        raise UserError(
+            f"the module '{module_name}' has no {kind.lower()} '{attribute}'; check the name after the colon"
+        )
+    return getattr(module, attribute)
 
 
 def entries(group: str) -> list[EntryPoint]:

@@ -10,11 +10,7 @@ return {
 
 from __future__ import annotations
 
-import re
-import sys
 from collections.abc import Callable
-from importlib import import_module
-from pathlib import Path
 from typing import Any
 
 from esp_cli.bodies.body import Body
@@ -23,7 +19,7 @@ from esp_cli.symmetry.elements import Element, Floats
 from esp_cli.symmetry.plane import PlaneElement
 from esp_cli.symmetry.representation import layout_operator
 from esp_envs.errors import UserError
-from esp_envs.installed import last_line
+from esp_envs.installed import import_named
 from esp_envs.spec import Layout, layout
 
 ACTION = "action"
@@ -56,18 +52,9 @@ def named_function(name: str) -> Callable[..., Any]:
     Raises:
         UserError: there is none.
     """
-    if not re.fullmatch(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*", name):
-        raise UserError(f"'{name[:80]}' names no function; write module:function, as in my_robot:mirror")
-    module, attribute = name.split(":")
-    sys.path.insert(0, str(Path.cwd()))
-    try:
-        found = getattr(import_module(module), attribute, None)
-    except (Exception, SystemExit) as error:
-        raise UserError(f"cannot import the module '{module}': {last_line(error)}") from error
-    finally:
-        sys.path.remove(str(Path.cwd()))
+    found: Callable[..., Any] = import_named(name, "function", "function", "my_robot:mirror")
     if not callable(found):
-        raise UserError(f"the module '{module}' has no function '{attribute}'; check the name after the colon")
+        raise UserError(f"'{name}' is no function; check the name after the colon")
     return found
 
 

@@ -224,7 +224,7 @@ def mistakes(seen: np.ndarray, acted: np.ndarray, told):
         ("numbers = lambda body: 1", "returns int; return layouts"),
         ("numbers = lambda body: {'action': 1}", "returns dict"),
         ("numbers = lambda body: {}", "returns dict"),
-        ("1 / 0", "cannot import the module 'my_{}': ZeroDivisionError"),
+        ("1 / 0", "cannot import the module 'my_{}' of the function: ZeroDivisionError"),
     ],
 )
 def test_numbers_that_say_nothing_are_refused(body, tmp_path, monkeypatch, text, words):
