@@ -44,6 +44,8 @@ class _OfModel(ParallelTask):
     """Further arguments of theirs."""
     keeps: ClassVar[tuple[str, ...]] = ("flip-x",)
     """Elements that the reward leaves alone; those of them that the model has are the task's symmetry."""
+    exact: ClassVar[bool] = True
+    """Whether the model is its own mirror image to the last digit; else these hold only nearly."""
     _known: ClassVar[dict[tuple[type, str], Layouts]] = {}
 
     def __init__(self, settings: TaskSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
@@ -57,7 +59,8 @@ class _OfModel(ParallelTask):
         known = self._known[key]
         self.observation, self.action, self.simulated = known.observation, known.action, known.simulated
         held = [Element((g,), order) for g, order in known.orders.items() if g.name in self.keeps]
-        self.symmetry = ",".join(element.name for element in held) or "c1"
+        found = ",".join(element.name for element in held) or "c1"
+        self.symmetry, self.nearly = (found, "") if self.exact else ("c1", found)
         super().__init__(settings, num_envs, generators)
 
     def _layouts(self, env: Any) -> Layouts:
@@ -136,6 +139,7 @@ class Humanoid(MujocoTask):
     """Gymnasium's Humanoid-v5; its model is its own mirror image but for a hip's armature and a knee's spring."""
 
     scenario, convention, terminates = "Humanoid-v5", "gymnasium Humanoid-v5", True
+    exact = False
 
 
 class Swimmer(MujocoTask):

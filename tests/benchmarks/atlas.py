@@ -24,14 +24,16 @@ if __name__ == "__main__":
     machine.prepare()  # as `esp` does, before torch is imported
 
 from esp_cli.checking import check_symmetry
-from esp_envs import Environment, make, register
+from esp_envs import Environment, UserError, make, register
+from esp_envs.promises import MakeWorlds
+from esp_envs.views import worlds_of_role
 from tests.benchmarks import atlas_tasks
 
 _VMAS = "esp_envs.adapters.vmas_scenarios"
 SCENARIOS = (
-    "Balance", "BallPassage", "BallTrajectory", "BuzzWire", "Discovery", "Dispersion", "Dropout", "Flocking", "GiveWay",
-    "JointPassage", "JointPassageSize", "MultiGiveWay", "Navigation", "Passage", "ReverseTransport", "Transport",
-    "Wheel", "WindFlocking",
+    "Balance", "BallPassage", "BallTrajectory", "BuzzWire", "Discovery", "Dispersion", "Dropout", "Flocking",
+    "Football", "GiveWay", "JointPassage", "JointPassageSize", "MultiGiveWay", "Navigation", "Passage",
+    "ReverseTransport", "Sampling", "Transport", "Wheel", "WindFlocking",
 )  # fmt: skip
 BUILT_IN = {
     "navigation": {}, "predator-prey": {}, "wildlife": {"width": 5, "height": 5, "horizon": 30},
@@ -42,15 +44,14 @@ COMMANDS = {"vmas": "pip install vmas", "mpe2": "pip install mpe2", "sisl": "pip
 NOT_CARRIED = {
     "mpe2 simple_crypto": "nothing in it has a place.",
     "vmas mpe and debug": "the former are the tasks of mpe2, the latter try the simulator.",
-    "vmas sampling": "no state says what is sampled.",
     "vmas road_traffic": "agents steer.",
-    "vmas football": "its opponents keep plans that no state holds.",
-    "mpe2 speaker, leader, prey and deposits": "agents of a task have to be alike, so one role of each is checked.",
     "sisl waterworld": "it is not part of PettingZoo 1.27.",
     "sisl multiwalker": "no turn or mirror of the plane moves what walkers see.",
-    "mujoco HalfCheetah, Hopper, Pusher": "no element could move anything in them.",
+    "mujoco Pusher": "no element could move its arm.",
 }
 """Why tasks are left out."""
+TRIED = {"collect_treasure": "d4,agents"}
+"""What is tried, where it is not what a check tries by default."""
 SECONDS = 300.0
 """Time for a check; what does not fit in is not covered."""
 
@@ -63,29 +64,39 @@ def tasks() -> Iterator[tuple[str, str, Callable[[], tuple[str, dict[str, object
         yield "vmas", name, lambda name=name: (register(f"{_VMAS}:{name}"), {}), None
     for package, found in (("mpe2", atlas_tasks.MPE), ("mujoco", atlas_tasks.MUJOCO)):
         for name, task in found.items():
-            texts = {"Walker2d-v5": atlas_tasks.LEGS, "collect_treasure (collectors)": "d4,agents"}.get(name)
-            yield package, name, lambda task=task: (register(task), {"workers": 0}), texts
-    for name in ("Ant-v5", "Humanoid-v5", "HumanoidStandup-v5"):
-        texts = "d4" if name == "Ant-v5" else "flip-x"
-        yield "mujoco", name, lambda name=name: (register(atlas_tasks.legged(name)), {"workers": 0}), texts
+            yield package, name, lambda task=task: (register(task), {"workers": 0}), TRIED.get(name)
+    for name in atlas_tasks.ROBOTS:
+        yield "mujoco", name, lambda name=name: (name, {"workers": 0}), None
+    for name in atlas_tasks.MORE_ROBOTS:
+        yield "mujoco", name, lambda name=name: (register(atlas_tasks.robot(name)), {"workers": 0}), None
     yield "sisl", "pursuit_v5", lambda: (register(atlas_tasks.PURSUIT), {"workers": 0}), "d4"
     yield "foraging", "8x8-2p-3f", lambda: (register(atlas_tasks.Foraging), {"workers": 0}), "d4,agents"
 
 
-def looked_at(package: str, name: str, given: Callable[[], tuple[str, Any]], texts: str | None) -> dict[str, Any]:
-    """Return what a check says of a task, or why it was not run."""
-    begun = time.process_time()
-    row: dict[str, Any] = {"package": package, "task": name}
+def looked_at(package: str, name: str, given: Callable[[], tuple[str, Any]], texts: str | None) -> list[dict[str, Any]]:
+    """Return what a check says of a task, in a row for each role, or why it was not run."""
     try:
         task, settings = given()
 
         def worlds(num_envs: int, seeds: Any) -> Environment:
             return make(task, num_envs, seeds, settings)
 
-        report = check_symmetry(worlds, texts, seconds=SECONDS)
+        roles = worlds(1, [0]).spec.roles
+        each = [(f"{name} ({role.name})", worlds_of_role(worlds, role.name)) for role in roles] or [(name, worlds)]
+        return [{"package": package, "task": own, **_found(made, texts)} for own, made in each]
     except (ImportError, ValueError) as error:
-        return row | {"not run": f"{error}", "command": COMMANDS.get(package, "")}
-    row |= {"found": report.found, "method": report.method, "elements": len(report.elements)}
+        return [{"package": package, "task": name, "not run": f"{error}", "command": COMMANDS.get(package, "")}]
+
+
+def _found(make_worlds: MakeWorlds, texts: str | None) -> dict[str, Any]:
+    begun = time.process_time()
+    try:
+        report = check_symmetry(make_worlds, texts, seconds=SECONDS)
+    except UserError as error:
+        if (reason := str(error).partition(" can be tried on ")[2].partition(": ")[2]) and "no transform" in str(error):
+            return {"found": "c1", "method": "its layouts", "elements": 0, "reason": reason}
+        raise
+    row: dict[str, Any] = {"found": report.found, "method": report.method, "elements": len(report.elements)}
     for element in report.elements:
         fields = [
             {
@@ -101,14 +112,21 @@ def looked_at(package: str, name: str, given: Callable[[], tuple[str, Any]], tex
     return row | {"seconds": round(time.process_time() - begun, 1)}
 
 
+def _task_of(row: dict[str, Any]) -> str:
+    """Return the name of a row's task, without the role."""
+    return str(row["task"]).partition(" (")[0]
+
+
 def page(rows: list[dict[str, Any]]) -> str:
     """Return the page."""
     text = Path(__file__).with_name("atlas_page.md").read_text()
     lines = ["| task | found | what breaks the others | decided by |", "|---|---|---|---|"]
+    order = {(package, name): k for k, (package, name, *_) in enumerate(tasks())}
+    rows = sorted(rows, key=lambda row: order.get((row["package"], _task_of(row)), len(order)))
     lines += [_line(row) for row in rows if "found" in row]
     missing = [f"- {row['package']} {row['task']}: {row['not run']}" for row in rows if "not run" in row]
     left = [f"- {names}: {why}" for names, why in NOT_CARRIED.items()]
-    known = {(row["package"], row["task"]) for row in rows}
+    known = {(row["package"], _task_of(row)) for row in rows}
     left += [f"- {p} {n}: not checked yet; `{COMMANDS.get(p, '')}`." for p, n, *_ in tasks() if (p, n) not in known]
     return text.replace("TABLE", "\n".join(lines)).replace("LEFT", "\n".join(left + missing))
 
@@ -124,7 +142,8 @@ def _line(row: dict[str, Any]) -> str:
         share = "" if found["share"] is None else f", in {found['share']:.2%} of the states"
         worst.setdefault(found["field"], (found["gap"], element, share))
         worst[found["field"]] = max(worst[found["field"]], (found["gap"], element, share))
-    told = [f"{field} by {gap:.3g} s.d. ({element}{share})" for field, (gap, element, share) in worst.items()]
+    told = [row["reason"]] if "reason" in row else []
+    told += [f"{field} by {gap:.3g} s.d. ({element}{share})" for field, (gap, element, share) in worst.items()]
     unseen = dict(row.get("not covered", {}))
     far = {name: unseen.pop(name) for name, found in list(unseen.items()) if _is_further_out(found)}
     for names, why in ((list(far), "only further out"), (list(unseen), "not covered")):
@@ -144,20 +163,14 @@ def main() -> None:
     if args.page:
         args.page.write_text(page(rows))
         return
-    known = {(row["package"], row["task"]) for row in rows if "found" in row}
+    known = {(row["package"], _task_of(row)) for row in rows if "found" in row}
     for package, name, given, texts in tasks():
         if (package, name) in known or not fnmatch(f"{package} {name}", args.only):
             continue
-        rows = [row for row in rows if (row["package"], row["task"]) != (package, name)]
-        rows.append(looked_at(package, name, given, texts))
-        print(
-            {
-                key: value
-                for key, value in rows[-1].items()
-                if key in ("package", "task", "found", "not run", "seconds")
-            },
-            flush=True,
-        )
+        rows = [row for row in rows if (row["package"], _task_of(row)) != (package, name)]
+        rows += looked_at(package, name, given, texts)
+        shown = ("package", "task", "found", "not run", "seconds")
+        print(*({k: row[k] for k in shown if k in row} for row in rows if _task_of(row) == name), flush=True)
         args.json.write_text(json.dumps(rows, indent=1) + "\n")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ from esp_envs.adapters.gymnasium import SingleAgentTask
 from esp_envs.adapters.pettingzoo import ParallelTask
 from esp_envs.mpe.task import MOVES
 from esp_envs.spec import discrete_moves
+from tests.envs import mpe_roles
 
 V, S, P, OTHERS = Kind.VECTOR, Kind.SCALAR, Kind.PSEUDOSCALAR, Items.OTHERS
 
@@ -41,11 +41,6 @@ def gym(name: str, *seen: Field, torques: int = 0, **attributes: Any) -> type[Si
     return type(name.title().replace("-", ""), (SingleAgentTask,), members | attributes)
 
 
-def still(self: ParallelTask, agent: str, observation: Any, generator: np.random.Generator) -> int:
-    """Let an agent that does not learn do anything."""
-    return int(generator.integers({"speaker_0": 3, "leadadversary_0": 20}.get(agent, 5)))
-
-
 def first_vectors(task: ParallelTask, agent: str, observation: Any) -> Any:
     """Put (cos, sin) of the arm and of the target side by side: [cos a, cos b, sin a, sin b, x, y, ...]."""
     a = np.asarray(observation)
@@ -53,6 +48,11 @@ def first_vectors(task: ParallelTask, agent: str, observation: Any) -> Any:
 
 
 ARM = (Field("arm", V), Field("bend", S), Field("side", P), Field("target", V), Field("spins", P, 2), Field("gap", V))
+OWN = (Field("position", V), Field("velocity", V))
+AROUND = (
+    Field("others", Kind.RECORD, 7, parts=(Field("at", V), Field("speed", V), Field("is", S, 4))),
+    Field("treasures", Kind.RECORD, 6, parts=(Field("at", V), Field("is", S, 2))),
+)
 MPE = {
     "simple": zoo("mpe2.simple_v3", Field("velocity", V), Field("mark", V)),
     "simple_formation": zoo(
@@ -64,60 +64,49 @@ MPE = {
         *(Field("velocity", V), Field("position", V), Field("landmarks", V, 3), Field("others", V, 2, items=OTHERS)),
         Field("messages", S, 4),
     ),
-    "simple_tag": zoo(
-        "mpe2.simple_tag_v3",
-        *(Field("velocity", V), Field("position", V), Field("landmarks", V, 2), Field("others", V, 2, items=OTHERS)),
-        *(Field("prey", V), Field("prey_velocity", V)),
-        learners="adversary",
-        opponent=still,
-    ),
-    "simple_adversary": zoo(
-        "mpe2.simple_adversary_v3",
-        *(Field("goal", V), Field("landmarks", V, 2), Field("adversary", V), Field("other", V, items=OTHERS)),
-        learners="agent",
-        opponent=still,
-    ),
     "simple_reference": zoo(
         "mpe2.simple_reference_v3",
         *(Field("velocity", V), Field("landmarks", V, 3), Field("color", S, 3), Field("words", S, 10)),
         action=Discrete(V, MOVES.points * 10, tuple(f"{move}, {word}" for word in range(10) for move in MOVES.names)),
     ),
-    "simple_speaker_listener (listener)": zoo(
-        "mpe2.simple_speaker_listener_v4",
-        *(Field("velocity", V), Field("landmarks", V, 3), Field("words", S, 3)),
-        learners="listener",
-        opponent=still,
+    "simple_tag": mpe_roles.Tag,
+    "simple_adversary": mpe_roles.Adversary,
+    "simple_speaker_listener": mpe_roles.SpeakerListener,
+    "simple_world_comm": mpe_roles.WorldComm,
+    "simple_push": zoo(
+        "mpe2.simple_push_v3",
+        observation={
+            "adversary": layout(Field("velocity", V), Field("landmarks", V, 2), Field("other", V)),
+            "agent": layout(
+                *(Field("velocity", V), Field("goal", V), Field("color", S, 3), Field("landmarks", V, 2)),
+                *(Field("colors", S, 6), Field("other", V)),
+            ),
+        },
+        action={"adversary": MOVES, "agent": MOVES},
     ),
-    "simple_world_comm (adversaries)": zoo(
-        "mpe2.simple_world_comm_v3",
-        *(Field("velocity", V), Field("position", V), Field("things", V, 5), Field("leader", V)),
-        *(Field("others", V, 2, items=OTHERS), Field("prey", V, 2), Field("prey_velocity", V, 2)),
-        *(Field("in_forest", S, 2), Field("words", S, 4)),
-        learners="adversary",
-        opponent=still,
-    ),
-    "collect_treasure (collectors)": zoo(
+    "collect_treasure": zoo(
         "mpe2.collect_treasure_v1",
-        *(Field("position", V), Field("velocity", V), Field("holding", S, 2)),
-        Field("others", Kind.RECORD, 7, parts=(Field("at", V), Field("speed", V), Field("is", S, 4))),
-        Field("treasures", Kind.RECORD, 6, parts=(Field("at", V), Field("is", S, 2))),
-        learners="collector",
-        opponent=still,
-    ),
-    "simple_push (agent)": zoo(
-        "mpe2.simple_push_v3",
-        *(Field("velocity", V), Field("goal", V), Field("color", S, 3), Field("landmarks", V, 2)),
-        *(Field("colors", S, 6), Field("other", V)),
-        learners="agent",
-        opponent=still,
-    ),
-    "simple_push (adversary)": zoo(
-        "mpe2.simple_push_v3",
-        *(Field("velocity", V), Field("landmarks", V, 2), Field("other", V)),
-        learners="adversary",
-        opponent=still,
+        observation={
+            "collector": layout(*OWN, Field("holding", S, 2), *AROUND),
+            "deposit": layout(*OWN, *AROUND),
+        },
+        action={"collector": MOVES, "deposit": MOVES},
     ),
 }
+
+
+def reached(self: SingleAgentTask, env: Any) -> Any:
+    """Return where the reacher's arm and target are, angles as (cos, sin), and how fast."""
+    q, v = env.unwrapped.data.qpos, env.unwrapped.data.qvel
+    return np.concatenate([[np.cos(q[0]), np.sin(q[0]), np.cos(q[1]), np.sin(q[1])], q[2:], v])
+
+
+def reach(self: SingleAgentTask, env: Any, state: Any) -> None:
+    """Put arm and target there."""
+    angles = np.arctan2(state[[1, 3]], state[[0, 2]])
+    env.unwrapped.set_state(np.concatenate([angles, state[4:6]]), state[6:])
+
+
 MUJOCO = {
     "InvertedPendulum-v5": gym("InvertedPendulum-v5", *(Field(n, P) for n in ("x", "angle", "v", "spin")), torques=1),
     "InvertedDoublePendulum-v5": gym(
@@ -126,41 +115,29 @@ MUJOCO = {
         torques=1,
         simulated=layout(Field("q", P, 3), Field("v", P, 3)),
     ),
-    "Swimmer-v5": gym(
-        "Swimmer-v5",
-        *(Field("angles", P, 3), Field("velocity", V), Field("spins", P, 3)),
+    "Reacher-v5": gym(
+        "Reacher-v5",
+        *ARM,
         torques=2,
-        simulated=layout(Field("place", V), Field("q", P, 3), Field("velocity", V), Field("v", P, 3)),
+        reading=first_vectors,
+        simulated=layout(*ARM[:5], Field("target_velocity", V)),
+        take=reached,
+        put=reach,
     ),
-    "Walker2d-v5": gym(
-        "Walker2d-v5",
-        *(Field("z", S), Field("angle", S), Field("joints", S, 6), Field("vx", S, 3), Field("rates", S, 6)),
-        action=Continuous(layout(Field("torque", S, 6))),
-        simulated=layout(Field("root", S, 3), Field("joints", S, 6), Field("roots", S, 3), Field("rates", S, 6)),
-    ),
-    "Reacher-v5": gym("Reacher-v5", *ARM, torques=2, reading=first_vectors),
 }
+ROBOTS = ("ant", "halfcheetah", "walker2d", "humanoid", "swimmer", "ant4x2", "halfcheetah2x3")
+"""Tasks that have a name here."""
+MORE_ROBOTS = ("HumanoidStandup-v5", "Hopper-v5")
+"""Other robots of Gymnasium, of which the models say all."""
 
 
-def legged(name: str) -> type[SingleAgentTask]:
-    """Return a task of a body with limbs, whose mirrors its model says."""
-    import gymnasium
+def robot(name: str) -> type[SingleAgentTask]:
+    """Return the task of such a robot."""
+    from esp_cli.bodies.gymnasium import MujocoTask
 
-    from esp_cli.bodies import Body
-
-    parts = dict.fromkeys(("cinert", "cvel", "qfrc_actuator", "cfrc_ext") if "Human" in name else ("cfrc_ext",), False)
-
-    def make_single(_: Any) -> Any:
-        return gymnasium.make(name, **{f"include_{part}_in_observation": wanted for part, wanted in parts.items()})
-
-    body = Body.from_mjcf(Path(gymnasium.__file__).parent / "envs/mujoco/assets" / f"{name[:-3].lower()}.xml")
-    seen = (Field("height", S), body.attitude(), body.positions(), body.velocity(), body.spin(), body.velocities())
-    members = {"simulated": layout(Field("place", V), *seen), "make_single": make_single}
-    return gym(name, *seen, action=Continuous(layout(body.controls())), **members)
+    return type(name.partition("-")[0], (MujocoTask,), {"scenario": name, "convention": name, "terminates": True})
 
 
-LEGS = "joints-3-4-5-0-1-2*rates-3-4-5-0-1-2*torque-3-4-5-0-1-2"
-"""The exchange of the walker's legs."""
 PURSUIT = zoo(
     "pettingzoo.sisl.pursuit_v5",
     Field("seen", Kind.PICTURE, 3, pixels=(7, 7)),

@@ -48,11 +48,12 @@ def test_ants_mirror_exchanges_the_legs_on_its_sides():
 
 @pytest.mark.parametrize(
     ("name", "symmetry", "width"),
-    [("halfcheetah", "c1", 17), ("walker2d", "flip-x", 17), ("humanoid", "flip-x", 348), ("swimmer", "flip-x", 8)],
+    [("halfcheetah", "c1", 17), ("walker2d", "flip-x", 17), ("humanoid", "c1", 348), ("swimmer", "flip-x", 8)],
 )
 def test_what_holds_of_the_others(name, symmetry, width):
     env = make(name, 1, [0], {"workers": 0})
     assert (env.spec.symmetry, env.spec.observation.width, env.spec.horizon) == (symmetry, width, 1000)
+    assert env.spec.nearly == ("flip-x" if name == "humanoid" else "")
 
 
 def test_walkers_mirror_exchanges_legs_and_swimmers_bends_the_other_way():

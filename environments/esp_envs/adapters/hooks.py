@@ -33,6 +33,8 @@ class CopyHooks(ABC):
     roles: Mapping[str, Sequence[Any]] = {}
     """The agents of each role; by default those whose names begin with the role's name in `observation`."""
     symmetry: str
+    nearly: str = ""
+    """A larger symmetry that holds nearly, which a prior may use all the same."""
     convention: str
     state: Layout | None = None
     """What `env.state()` returns; by default the global state is all agents' observations, one after the other."""

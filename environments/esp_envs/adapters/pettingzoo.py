@@ -106,6 +106,7 @@ class ParallelTask(CopyHooks, Environment):
             convention=self.convention,
             horizon=self.settings.horizon,
             symmetry=self.symmetry,
+            nearly=self.nearly,
             state=self.state,
             terminates=self.terminates,
             agents_end=self.agents_end,

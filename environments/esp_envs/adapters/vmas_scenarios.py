@@ -1,8 +1,8 @@
 """VMAS scenarios with a layout: which number is what, and under what the scenario is symmetric.
 
 Name one as `--task esp_envs.adapters.vmas_scenarios:Transport`. Those with settings of their own are classes, the
-others lines of a table. Left out are sampling, of which no state says what is sampled, and road_traffic, whose agents
-steer.
+others lines of a table. Left out is road_traffic, whose agents steer. What lies around in sampling is no part of the
+state: it is drawn anew in each episode, and lies in wait where a check puts the agents.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from esp_envs.adapters.vmas import VmasSettings, VmasTask
 from esp_envs.settings import TaskSettings
-from esp_envs.spec import Field, Kind, Layout, layout
+from esp_envs.spec import Field, Items, Kind, Layout, layout
 
 _OWN = (Field("position", Kind.VECTOR, unit="length", is_point=True), Field("velocity", Kind.VECTOR, unit="length/s"))
 
@@ -165,6 +165,23 @@ def _line_direction(_: VmasTask, obs: Tensor) -> Tensor:
     return torch.cat([obs[..., :10], double.cos(), double.sin(), obs[..., 11:]], -1)
 
 
+def _samples_around(_: VmasTask, obs: Tensor) -> Tensor:
+    """Give the cells around an agent counter-clockwise from the right."""
+    return torch.cat([obs[..., :16], obs[..., 16:][..., [0, 7, 2, 6, 1, 4, 3, 5]]], -1)
+
+
+def _player(rival: str) -> Layout:
+    """Return what a player of football sees, the other players as vectors from them."""
+    body = tuple(Field(name, Kind.VECTOR) for name in ("offset", "relative_velocity", "velocity", "force"))
+    ball = _vectors("force", "from_ball", "ball_relative_velocity", "ball_from_goal", "ball_velocity", "ball_force")
+    return layout(
+        *ball,
+        *_vectors("from_goal", "velocity"),
+        Field("rivals", Kind.RECORD, 3, parts=body, family=rival),
+        Field("fellows", Kind.RECORD, 2, parts=body, items=Items.OTHERS),
+    )
+
+
 _WHEEL = (
     *_vectors("from_line", "end", "other_end"),
     Field("level", Kind.SCALAR),
@@ -178,6 +195,16 @@ BallTrajectory = _scenario("ball_trajectory", "c1", *_OWN, *_vectors("from_ball"
 BuzzWire = _scenario("buzz_wire", "c1", *_OWN, *_vectors("from_goal"), agents=2, fixed=True)
 Discovery = _scenario("discovery", "c1", *_OWN, Field("lidar", Kind.RING, rays=15), agents=5)
 Dropout = _scenario("dropout", "c1", *_OWN, *_vectors("goal"), Field("done", Kind.SCALAR), agents=4, flags=("eaten",))
+Football = _scenario(
+    "football",
+    "c1",
+    agents=6,
+    arguments=lambda _: {"ai_red_agents": False},
+    seen=lambda _: {
+        "agent_blue": _player("agent_red"),
+        "agent_red": _player("agent_blue"),
+    },
+)
 Flocking = _scenario("flocking", "c1", *_OWN, *_vectors("from_target"), Field("lidar", Kind.RING, rays=12), agents=4)
 GiveWay = _scenario("give_way", "c1", *_OWN, agents=2, fixed=True, own_goals="goal")
 JointPassage = _scenario(
@@ -199,5 +226,9 @@ Passage = _scenario("passage", "c1", *_OWN, *_vectors("goal", "passage"), agents
 ReverseTransport = _scenario(
     "reverse_transport", "c1", *_OWN, *_vectors("package_velocity", "package", "package_from_goal"), agents=4
 )
+Sampling = _scenario(
+    "sampling", "c1", *_OWN, *(Field(name, Kind.RING, rays=rays) for name, rays in (("lidar", 12), ("samples", 8))),
+    agents=3, reading=_samples_around,
+)  # fmt: skip
 Wheel = _scenario("wheel", "c1", *_OWN, *_WHEEL, agents=4, reading=_line_direction)
 WindFlocking = _scenario("wind_flocking", "c1", *_OWN, agents=2, fixed=True)
