@@ -134,11 +134,12 @@ class Run:
         episodes: int | None = None,
         view: View = "auto",
         size: int = 480,
+        width: float | None = None,
         speed: float = 1.0,
         greedy: bool = True,
         settings: Mapping[str, object] | None = None,
     ) -> Drawing:
-        """Draw episodes of one seed's policy as a film (.gif, .mp4), or a picture of one episode (.png).
+        """Draw episodes of one seed's policy as a film (.gif, .mp4), or a picture (.png, .pdf, .svg) of one episode.
 
         Args:
             out: the file.
@@ -146,13 +147,14 @@ class Run:
             episodes: of a film; by default they last about 8 s.
             view: "top" from above, "3d" in space, "auto" the latter where the task has it.
             size: of the longer side, pixels.
+            width: of a picture for print, mm; letters then have 8 points.
             speed: times real time.
             greedy: whether it takes its most probable actions, or draws them.
             settings: as of `evaluate`.
         """
         from esp_cli.drawing.draw import Request, draw  # noqa: PLC0415 - training needs no plotting
 
-        request = Request(Path(out), seed, episodes, view, size, speed, greedy=greedy)
+        request = Request(Path(out), seed, episodes, view, size, speed, width=width, greedy=greedy)
         return draw(request, [self._trained(settings)])
 
     def _trained(self, settings: Mapping[str, object] | None) -> TrainedPolicy:

@@ -145,6 +145,8 @@ class Environment(ABC):
     spec: TaskSpec
     heuristics: tuple[str, ...] = ()
     """Names that `heuristic` accepts, the main anchor first; an environment may have fewer than its class."""
+    ending: str = "before its time"
+    """What has come where an episode is terminated, for a film's last frame."""
     renews: bool = True
     """Whether worlds whose episode ends begin the next one. Who sets each state may do without where that takes long;
     `next` then holds what was reached. An environment may ignore it."""

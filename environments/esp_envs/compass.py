@@ -40,7 +40,7 @@ class Compass(Environment):
 
     def __init__(self, inner: Environment, length: float, labels: bool = False) -> None:
         super().__init__(inner.settings, inner.num_envs, inner.generators)
-        self.inner, self.heuristics = inner, inner.heuristics
+        self.inner, self.heuristics, self.ending = inner, inner.heuristics, inner.ending
         spec = inner.spec
         self._joint = spec.is_joint
         self.spec = framed(spec, labels)

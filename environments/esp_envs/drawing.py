@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageColor, ImageDraw
+from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from esp_envs.errors import UserError
-from esp_envs.scene import Body, Scene
+from esp_envs.scene import DARK, Body, Scene, holders
 
 _OVERSAMPLING = 3  # everything is drawn this much larger and averaged down, which smooths the edges
 BACKGROUND = "#fafaf7"
@@ -19,6 +20,8 @@ FRAME = "#c8c8c0"
 _RIM_DARKENING = 0.7
 TRAIL_WIDTH = 0.3  # width of a trail against the body's radius
 _TRAIL_STRENGTH = 0.8  # how much of the body's colour the newest end of a trail has; the oldest has almost none
+_LEAST_LETTER, _MOST_LETTER = 6.0, 18.0
+"""Radius of a disc that a letter fits on, and height of the largest letter, pixels."""
 _SHAPES = ("disc", "ring", "cross", "square")
 
 _Color = tuple[int, ...]
@@ -46,6 +49,10 @@ def draw(scene: Scene, size: int = 320, trail: Sequence[Scene] = ()) -> NDArray[
         canvas.trail(path, body)
     for body in scene.bodies:
         canvas.body(body)
+    for index in holders(scene):
+        canvas.ring(scene.bodies[index])
+    for body in scene.bodies:
+        canvas.letter(body)
     return canvas.pixels()
 
 
@@ -65,6 +72,18 @@ def trails(scene: Scene, earlier: Sequence[Scene]) -> Iterator[tuple[Body, list[
         if body.trail and earlier:
             path = [past.bodies[index].position for past in earlier if index < len(past.bodies)]
             yield body, [*path, body.position]
+
+
+@lru_cache(maxsize=8)
+def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """Return the font of all pictures at a height of letters in pixels."""
+    return ImageFont.load_default(size)
+
+
+def ink(color: str) -> str:
+    """Return the colour of letters that are read on a colour: white or dark."""
+    red, green, blue = ImageColor.getrgb(color)[:3]
+    return "white" if 0.3 * red + 0.59 * green + 0.11 * blue < 140 else DARK
 
 
 def fade(color: str, share: float) -> tuple[int, ...]:
@@ -122,6 +141,28 @@ class _Canvas:
         if body.heading is not None:
             tip = (x + radius * math.cos(body.heading), y - radius * math.sin(body.heading))
             self._draw.line([(x, y), tip], fill=rim, width=thick)
+
+    def ring(self, body: Body) -> None:
+        """Ring a body in black and white, which shows on every colour."""
+        (x, y), thin = self._at(body.position), _OVERSAMPLING
+        radius = max(2 * body.radius * self._scale, 3 * thin)
+        self._draw.ellipse(_box(x, y, radius), outline=DARK, width=2 * thin)
+        self._draw.ellipse(_box(x, y, radius - 2 * thin), outline="white", width=thin)
+
+    def letter(self, body: Body) -> None:
+        """Write the letter of a body on it, or beside it where it would not be read there."""
+        (x, y), radius = self._at(body.position), body.radius * self._scale
+        if not body.name:
+            return
+        if body.shape == "disc" and body.heading is None and radius >= _LEAST_LETTER * _OVERSAMPLING:
+            size = min(1.2 * radius, _MOST_LETTER * _OVERSAMPLING)
+            self._draw.text((x, y), body.name, ink(body.color), font(round(size)), anchor="mm")
+        else:
+            beside, edge = 0.8 * radius + 5 * _OVERSAMPLING, 7 * _OVERSAMPLING
+            width, height = self._image.size
+            x += -beside if body.shape == "ring" else beside
+            at = (min(max(x, edge), width - edge), min(max(y - beside, edge), height - edge))
+            self._draw.text(at, body.name, DARK, font(11 * _OVERSAMPLING), anchor="mm")
 
     def pixels(self) -> NDArray[np.uint8]:
         return np.asarray(self._image.resize(self._size, Image.Resampling.BOX), dtype=np.uint8).copy()

@@ -4,13 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
-COLORS = ("#3f6fd8", "#d8703f", "#3fa86a", "#a04fc0", "#c0a030", "#30a0b8", "#c04070", "#607080")
-"""Of agents, in their order."""
+COLORS = ("#0072B2", "#E69F00", "#c3576f", "#4e3200", "#86c5fd", "#aa7532", "#0b2697", "#e3ce94")
+"""Of agents and of curves, in their order: any two differ by 30 CIE76 or more, also without red or green cones."""
+DARK, PALE = "#202020", "#d4d4d4"
+"""Of what agents look for, and of what is in their way; as far from those above and from each other."""
+
+
+class Look(TypedDict):
+    """What tells an agent from the others, as arguments of a `Body`."""
+
+    color: str
+    name: str
+
+
+def look(index: int) -> Look:
+    """Return the colour and the letter of the agent with this index; the 27th and later have none."""
+    return Look(color=COLORS[index % len(COLORS)], name=chr(ord("A") + index) if index < 26 else "")
 
 
 @dataclass(frozen=True)
@@ -27,6 +41,8 @@ class Body:
         model: what a renderer in space builds of it ("robot", "pillar", "goal"); flat pictures ignore it.
         label: what a legend calls it, or None for no entry.
         reach: distance within which a body that leaves a trail covers it, in world units; None for what nobody covers.
+        held: what a legend calls that; a renderer rings the body while it is so.
+        name: a letter that is written on it, or beside it where it is small or has a nose.
     """
 
     position: tuple[float, float]
@@ -38,6 +54,8 @@ class Body:
     model: str | None = None
     label: str | None = None
     reach: float | None = None
+    held: str = "covered"
+    name: str = ""
 
 
 GRID_SPACING = 0.5  # distance of the lines behind a scene, unless it says otherwise
@@ -56,6 +74,19 @@ class Scene:
     grid: tuple[float, float] = (GRID_SPACING, 0.0)
     unit: str = ""
     picture: NDArray[np.uint8] | None = field(default=None, compare=False)
+
+
+def holders(scene: Scene) -> dict[int, int]:
+    """Return which body is covered by which: for the index of each body within reach of others, that of the nearest."""
+    able = [k for k, body in enumerate(scene.bodies) if body.trail]
+    wanted = [k for k, body in enumerate(scene.bodies) if body.reach is not None]
+    if not able or not wanted:
+        return {}
+    theirs, places = (np.array([scene.bodies[k].position for k in group]) for group in (able, wanted))
+    distance = np.hypot(*np.moveaxis(places[:, None] - theirs, -1, 0))
+    distance[np.equal.outer(wanted, able)] = np.inf  # none covers itself
+    found = zip(wanted, distance.argmin(1).tolist(), distance.min(1).tolist(), strict=True)
+    return {k: able[nearest] for k, nearest, apart in found if apart < (scene.bodies[k].reach or 0.0)}
 
 
 class Painter(Protocol):

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from esp_envs.batched import BatchedTask, Outcome, World
 from esp_envs.errors import UserError
-from esp_envs.scene import COLORS, Body, Scene
+from esp_envs.scene import DARK, Body, Scene, look
 from esp_envs.settings import Breaks, TaskSettings
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Discrete, Field, Items, Kind, TaskSpec, layout, others_of
 
@@ -81,7 +81,6 @@ def wildlife_spec(settings: WildlifeSettings) -> TaskSpec:
     )
 
 
-_POACHER_COLOR = "#202020"
 _DRONE = ((0.0, 1.0, 0.0), (1.0, 1.0, 1.0), (0.0, 1.0, 0.0))
 _POACHER = ((1.0, 0.0, 1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 1.0))
 """A plus and a cross: both are the same after every turn and mirror of the square."""
@@ -136,6 +135,7 @@ class Wildlife(BatchedTask):
 
     Settings: ClassVar[type[WildlifeSettings]] = WildlifeSettings
     heuristics = ("surround",)
+    ending = "captured"
     makes_new_tensors = True
     settings: WildlifeSettings
 
@@ -247,8 +247,8 @@ class Wildlife(BatchedTask):
 
     def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
         *drones, poacher = [(float(x), float(y)) for x, y in self.world["cells"][world].tolist()]
-        bodies = [Body(place, 0.4, COLORS[i % len(COLORS)], label="drone") for i, place in enumerate(drones)]
-        bodies.append(Body(poacher, 0.25, _POACHER_COLOR, shape="cross", label="poacher"))
+        bodies = [Body(place, 0.4, label="drone", **look(i)) for i, place in enumerate(drones)]
+        bodies.append(Body(poacher, 0.25, DARK, shape="cross", label="poacher"))
         right, top = self.settings.width / 2, self.settings.height / 2
         return Scene(tuple(bodies), (-right, right, -top, top), grid=(1.0, 0.5), unit="cells")
 

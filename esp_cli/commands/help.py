@@ -37,7 +37,7 @@ _GROUPS: dict[str, tuple[str, ...]] = {
         "mode",
         "threshold",
     ),
-    _PICTURE: ("view", "size", "speed", "fps", "plot", "films"),
+    _PICTURE: ("view", "size", "width", "speed", "fps", "style", "plot", "films"),
     _OUTPUT: ("out", "force", "json", "csv", "results", "full", "track", "formats", "name"),
 }
 _MOVED: dict[str, dict[str, str]] = {  # options that belong elsewhere in a command than in the others

@@ -17,7 +17,7 @@ EPILOG = """Examples:\n
     esp render runs/cn-mappo -o cn.gif\n
     esp render runs/cn-mappo -o cn.gif --episodes 5 --size 320 --speed 0.5\n
     esp render runs/fc-mappo -o formation.gif --speed 4x\n
-    esp render runs/fc-mappo -o formation.png --view top\n
+    esp render runs/fc-mappo -o formation.pdf --width 89\n
     esp render formation-mappo-plain formation-mappo-esp -o both.gif"""
 
 
@@ -64,6 +64,12 @@ def render(
         float | None,
         typer.Option("--fps", min=1, max=60, help="Most frames per second: 25 unless given, in a GIF up to 50."),
     ] = None,
+    width: Annotated[
+        float | None,
+        typer.Option(
+            "--width", min=20, max=1000, help="Width of a picture for print in mm, as 89: letters of 8 points."
+        ),
+    ] = None,
     stochastic: Annotated[bool, typer.Option("--stochastic", help="Draw actions instead of the greedy ones.")] = False,
     physics: options.PhysicsOption = None,
     settings: options.TaskSetOption = None,
@@ -71,14 +77,14 @@ def render(
     network: options.OwnNetworkOption = None,
     prior: options.BundledPriorOption = None,
 ) -> None:
-    """Play episodes and draw them off-screen: a film (.gif, .mp4), or a picture of one episode (.png).
+    """Play episodes and draw them off-screen: a film (.gif, .mp4), or a picture (.png, .pdf, .svg) of one episode.
 
-    The picture shows paths; of navigation also who covers which landmark when, of wildlife the last steps.
+    The picture shows paths, below them who covers which landmark or catches the prey when; of wildlife the last steps.
     """
-    from esp_cli.drawing.draw import PICTURE, Request, draw
+    from esp_cli.drawing.draw import Request, draw
     from esp_cli.policies.loading import open_policy
 
-    request = Request(out, seed, episodes, view, size, speed, fps, not stochastic)
+    request = Request(out, seed, episodes, view, size, speed, fps, width, not stochastic)
     options.register_named(task, [algo], network)
     changed = options.parse_task_settings(settings or [], physics)
     named = [policy] if beside is None else [policy, beside]
@@ -89,5 +95,5 @@ def render(
         drawing = draw(request, opened, [where.name for where in named], watch)
     film = f"{drawing.frames} frames -> {out} ({out.stat().st_size / 1024:.0f} kB)"
     picture = f"episode of {drawing.steps} steps -> {out}"
-    for text in filter(None, (drawing.note, picture if request.kind == PICTURE else film)):
+    for text in filter(None, (drawing.note, picture if request.is_picture else film)):
         console.note(text)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -23,7 +23,7 @@ EPILOG = """Examples:\n
     esp report runs/table1 --films --results docs/measured/table1.json\n
     esp report runs/cn-mappo runs/cn-mappo-esp\n
     esp report plain=runs/cn-mappo ESP=runs/cn-mappo-esp --at 500k --at 3M --threshold -125 --plot curves.png\n
-    esp report plain=runs/cn-mappo ESP=runs/cn-mappo-esp --out comparison"""
+    esp report plain=runs/cn-mappo ESP=runs/cn-mappo-esp --style paper --out comparison"""
 
 
 def report(
@@ -55,6 +55,10 @@ def report(
         Mode | None, typer.Option("--mode", help="Which evaluations; greedy, unless the study is about others.")
     ] = None,
     plot: Annotated[Path | None, typer.Option("--plot", help="Draw the curves as PNG and SVG.")] = None,
+    style: Annotated[
+        Literal["screen", "paper"],
+        typer.Option("--style", help="Of figures; paper: as wide as a column or a page, small letters, also as PDF."),
+    ] = "screen",
     csv: Annotated[
         Path | None,
         typer.Option(
@@ -89,15 +93,15 @@ def report(
         from esp_cli.reporting.page import write_csv
 
         console.note(f"{write_csv(csv, material)} rows -> {csv}")
-    _write_page(material, out, films)
+    _write_page(material, out, films, style)
     if results is not None:
         console.write_json(results, material.results.document())
         console.note(f"results -> {results}")
     if plot is not None:
         from esp_cli.reporting.study_figures import draw_curves
 
-        picture, _ = draw_curves(material, plot)
-        for file in (picture.png, picture.svg):
+        picture, _ = draw_curves(material, plot, style)
+        for file in (picture.png, picture.svg, *([picture.svg.with_suffix(".pdf")] if style == "paper" else [])):
             console.note(f"curves -> {file}")
     console.result(json, material.results.document(statistics=True), lambda: print_answer(material, full))
     if not full and json != "-":
@@ -146,14 +150,14 @@ def threshold_words(thresholds: Sequence[float]) -> list[str]:
     return [word for limit in thresholds for word in ("--threshold", repr(limit).removesuffix(".0"))]
 
 
-def _write_page(material: Material, out: Path | None, films: bool) -> None:
+def _write_page(material: Material, out: Path | None, films: bool, style: Literal["screen", "paper"]) -> None:
     from esp_cli.reporting.page import draw_films, write_report
 
     if films:
         with console.TrainingProgress(len(material.runs), description="draw", unit="films") as progress:
             draw_films(material.runs, progress.update)
     if out is not None and material.curves:
-        for file in write_report(material, out):
+        for file in write_report(material, out, style):
             console.note(f"report -> {file}")
     elif out is not None:
         console.note("no run has an evaluation yet, so there is nothing to draw")

@@ -8,13 +8,18 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Literal, get_args
 
+import matplotlib as mpl
+from matplotlib.figure import Figure
+
 from esp_cli.defaults import SLOWEST
-from esp_cli.drawing.figures import summary
-from esp_cli.drawing.films import GIF_FRAMES_PER_SECOND, Frame, beside, frame, write_gif, write_mp4, write_png
+from esp_cli.drawing.figures import INCHES, PAPER, PAPER_DPI, STEADY, UNDATED, summary
+from esp_cli.drawing.films import GIF_FRAMES_PER_SECOND, Frame, frame, write_gif, write_mp4, write_png
 from esp_cli.drawing.recording import HOLD_SECONDS, Episode, Moment, framed, record
+from esp_cli.files.writing import write_file
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training.build import build_environment
 from esp_envs.base import Environment
@@ -24,7 +29,8 @@ from esp_envs.scene import Painter
 
 View = Literal["auto", "top", "3d"]
 
-FILMS, PICTURE = (".gif", ".mp4"), ".png"
+FILMS, PICTURES = (".gif", ".mp4"), (".png", ".pdf", ".svg")
+_MM_PER_INCH = 25.4
 FRAMES_PER_SECOND = 25  # most frames per second of a film, unless more are asked for
 _SAMPLED_FRAMES = 8  # frames that the palette of a GIF is made for
 
@@ -33,24 +39,29 @@ _SAMPLED_FRAMES = 8  # frames that the palette of a GIF is made for
 class Request:
     """How a policy is drawn, and into what."""
 
-    out: Path  # a .gif or .mp4 for a film, a .png for a picture of one episode
+    out: Path  # a .gif or .mp4 for a film, a .png, .pdf or .svg for a picture of one episode
     seed: int | None = None  # whose policy acts; by default the first
     episodes: int | None = None  # of a film; by default as many as last about 8 s
     view: View = "auto"  # see `open_painter`
     size: int = 480  # of the longer side of a scene, pixels; caption, axes and legend come on top
     speed: float = 1.0  # times real time, 0.01 or more
     fps: float | None = None  # most frames per second; by default 25
+    width: float | None = None  # of a picture for print, mm; by default as large as `size` says
     greedy: bool = True  # whether the policy takes its most probable actions, or draws them
 
     def __post_init__(self) -> None:
-        if self.kind not in (*FILMS, PICTURE):
-            raise UserError(f"cannot write {self.out}: name a .gif, .mp4 or .png file")
+        if self.kind not in (*FILMS, *PICTURES):
+            raise UserError(f"cannot write {self.out}: name a .gif or .mp4 film, or a .png, .pdf or .svg picture")
         if self.episodes is not None and self.episodes < 1:
             raise UserError(f"episodes is {self.episodes}; a film has at least one")
-        if self.kind == PICTURE and self.episodes is not None and self.episodes > 1:
+        if self.is_picture and self.episodes is not None and self.episodes > 1:
             raise UserError(f"{self.out} holds one episode; leave out --episodes {self.episodes} or name a .gif file")
-        if self.kind == PICTURE and self.fps is not None:
+        if self.width is not None and not self.is_picture:
+            raise UserError(f"{self.out} is a film, whose width --size sets in pixels; leave out --width")
+        if self.is_picture and self.fps is not None:
             raise UserError(f"{self.out} is a picture without frames; leave out --fps or name a .gif or .mp4 file")
+        if self.width is not None and not 20 <= self.width <= 1000:
+            raise UserError(f"width is {self.width:g}; give 20 to 1000 mm, as 89 for a column")
         if not SLOWEST <= self.speed < math.inf:  # false for what is no number
             raise UserError(f"speed is {self.speed}; give times real time, {SLOWEST:g} or more")
         if self.view not in get_args(View):
@@ -61,6 +72,18 @@ class Request:
     @property
     def kind(self) -> str:
         return self.out.suffix.lower()
+
+    @property
+    def is_picture(self) -> bool:
+        return self.kind in PICTURES
+
+    @property
+    def for_print(self) -> bool:
+        return self.is_picture and (self.kind != ".png" or self.width is not None)
+
+    @property
+    def inches(self) -> float:
+        return INCHES if self.width is None else self.width / _MM_PER_INCH
 
     @property
     def rate(self) -> float:
@@ -89,26 +112,37 @@ def draw(
     acting, spec = _acting(request, policies), policies[0].spec
     titles = names if len(policies) > 1 else [None]
     env = build_environment(acting[0].config, 1, "film")
-    with open_painter(env, request.view, request.size) as painter:
-        recorded = record(acting, 1 if request.kind == PICTURE else request.episodes, request.greedy)
+    view = "top" if request.for_print and request.view == "auto" else request.view
+    with open_painter(env, view, request.size) as painter:
+        recorded = record(acting, 1 if request.is_picture else request.episodes, request.greedy)
         flat = isinstance(painter, TopPainter) and recorded[0][0].scenes[0].picture is None
         recorded = framed(recorded) if flat else recorded
         # steps from one frame to the next: the fewest that keep to the frame rate
         every = max(1, math.ceil(request.speed / (spec.control_period_s * request.rate) - 1e-9))
         taken = shots(recorded, every, spec.control_period_s, spec.name, titles)
-        if request.kind != PICTURE:
+        if not request.is_picture:
             report = watch or (lambda *_: None)
             step_s = spec.control_period_s / request.speed
             write_film(request.out, painter, taken, step_s, lambda done: report(done, len(taken)))
         elif flat:
-            shown = zip(recorded, titles, strict=True)
-            figures = [summary(own[0], title or spec.name, request.size, spec.control_period_s) for own, title in shown]
-            write_png(request.out, beside(figures, 0))
+            shown = [(own[0], title or spec.name) for own, title in zip(recorded, titles, strict=True)]
+            write_figure(request, lambda: summary(shown, spec.control_period_s, request.inches))
+        elif request.for_print:
+            raise UserError(f"what draws {spec.name} gives pixels, not lines; name a .png file without --width")
         else:
             write_png(request.out, taken[-1].draw(painter))
     steps = sum(episode.steps for episode in recorded[0])
     returns = tuple(sum(episode.returns[-1] for episode in own) / len(own) for own in recorded)
-    return Drawing(request.out, 1 if request.kind == PICTURE else len(taken), steps, returns, painter.note)
+    return Drawing(request.out, 1 if request.is_picture else len(taken), steps, returns, painter.note)
+
+
+def write_figure(request: Request, make: Callable[[], Figure]) -> None:
+    """Make a figure in the style that was asked for, and write it as PNG, PDF or SVG."""
+    content, kind = BytesIO(), request.kind[1:]
+    style, dpi = ({}, request.size / INCHES) if request.width is None else (PAPER, PAPER_DPI)
+    with mpl.rc_context({**style, **STEADY}):
+        make().savefig(content, format=kind, dpi=dpi, metadata=UNDATED[kind])
+    write_file(request.out, content.getvalue())
 
 
 def _acting(request: Request, policies: Sequence[TrainedPolicy]) -> list[TrainedPolicy]:

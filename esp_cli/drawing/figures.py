@@ -3,102 +3,119 @@
 from __future__ import annotations
 
 import math
-from io import BytesIO
+from collections.abc import Callable, Sequence
 from itertools import groupby, pairwise
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure, FigureBase, SubFigure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
-from PIL import Image
 
-from esp_cli.drawing.films import Frame, Mark, marks
+from esp_cli.drawing.films import Mark, marks
 from esp_cli.drawing.recording import Episode
-from esp_envs.drawing import GRID, trails
-from esp_envs.scene import Body, Scene
+from esp_envs.drawing import GRID, ink, trails
+from esp_envs.scene import DARK, Body, Scene, holders
 
-_INCHES = 4.8
-_OPACITY = (0.15, 1.0)  # opacity of a path at its beginning and at its end
+PAPER: dict[Any, Any] = {"font.size": 8, "legend.fontsize": 7, "pdf.fonttype": 42}
+"""How figures for print differ: letters of 8 points, embedded as outlines that search and editors know."""
+PAPER_DPI = 300
+STEADY: dict[Any, Any] = {"svg.hashsalt": "esp", "text.parse_math": False}
+"""Identifiers in SVG files are drawn at random unless salted; a dollar sign in a name stays one."""
+UNDATED: dict[str, dict[str, None]] = {
+    "png": {"Software": None},
+    "svg": {"Date": None, "Creator": None},
+    "pdf": {"CreationDate": None, "Creator": None, "Producer": None},
+}
+"""Dates and versions would make every file differ from the last."""
+INCHES = 4.8  # width of a picture, unless another is asked for
+_ENTRIES_PER_INCH = 0.9  # of a legend, in one row
+_OPACITY = (0.15, 1.0)  # strength of a path's colour at its beginning and at its end
+_LEAST_LETTER = 0.16  # diameter of a disc that a letter is written on, inches
+_BARS, _BAR = 0.75, 0.28  # height of what is below the paths: of axis and legend, and of each bar, inches
 _PANELS, _COLUMNS = 6, 3  # steps that a strip shows, and how many of them in a row
 _NUMBER = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
 _MARKERS = {"disc": "o", "ring": "o", "square": "s", "cross": "x"}
 
 
-def summary(episode: Episode, title: str, size: int, period_s: float) -> Frame:
-    """Draw an episode, whose steps take `period_s` seconds, as one picture that is `size` pixels wide."""
-    last = episode.scenes[-1]
-    title = f"{title}, return {episode.returns[-1]:.1f}"
-    if any(body.reach is not None for body in last.bodies):
-        figure = coverage(episode, title, size, period_s)
-    elif any(body.trail for body in last.bodies):
-        figure = paths(episode, title, size)
-    else:
-        figure = strip(episode, title, size, period_s)
-    content = BytesIO()
-    figure.savefig(content, format="png")
-    return np.asarray(Image.open(content).convert("RGB"))
+def summary(shown: Sequence[tuple[Episode, str]], period_s: float, width: float = INCHES) -> Figure:
+    """Draw episodes with their titles side by side, each `width` inches wide; their steps take `period_s` seconds.
+
+    An episode is drawn as what covers what when, as paths, or as its last steps, whichever its bodies are made for.
+    """
+    ways, heights = zip(*(_way(episode, width) for episode, _ in shown), strict=True)
+    figure = Figure(figsize=(len(shown) * width, max(heights)), layout="constrained")
+    parts = figure.subfigures(1, len(shown), squeeze=False)[0]
+    for part, way, (episode, title) in zip(parts, ways, shown, strict=True):
+        way(part, episode, f"{title}, return {episode.returns[-1]:.1f}", period_s)
+    return figure
 
 
-def paths(episode: Episode, title: str, size: int) -> Figure:
-    """Draw the paths of an episode as in figure 6c of the paper: a colour for each body, more opaque with time."""
-    figure = Figure(figsize=(_INCHES, _INCHES), dpi=size / _INCHES, layout="constrained")
+def _way(episode: Episode, width: float) -> tuple[Callable[[SubFigure, Episode, str, float], None], float]:
+    """Return how an episode is drawn, and how high that is at a width, inches."""
+    bodies = episode.scenes[-1].bodies
+    if wanted := sum(body.reach is not None for body in bodies):
+        return coverage, width + _BARS + _BAR * wanted
+    if any(body.trail for body in bodies):
+        return paths, width
+    return strip, 0.75 + math.ceil(min(episode.steps + 1, _PANELS) / _COLUMNS) * (width / _COLUMNS + 0.15)
+
+
+def paths(figure: SubFigure, episode: Episode, title: str, _: float) -> None:
+    """Draw the paths of an episode as in figure 6c of the paper: a colour for each body, stronger with time."""
     axes = _axes(figure.add_subplot(), episode.scenes[-1])
     _title(axes, title)
     _add_paths(axes, episode)
     _add_legend(figure, episode.scenes[-1], started=True)
-    return figure
 
 
-def coverage(episode: Episode, title: str, size: int, period_s: float) -> Figure:
+def coverage(figure: SubFigure, episode: Episode, title: str, period_s: float) -> None:
     """Draw the paths of an episode, and below them when each agent covers each body with a reach."""
     last = episode.scenes[-1]
     wanted = [k for k, body in enumerate(last.bodies) if body.reach is not None]
-    rows = 0.28 * len(wanted) + 0.75
-    figure = Figure(figsize=(_INCHES, _INCHES + rows), dpi=size / _INCHES, layout="constrained")
-    above, below = figure.subplots(2, height_ratios=(_INCHES, rows))
+    above, below = figure.subplots(2, height_ratios=(_width(figure), _BARS + _BAR * len(wanted)))
     _title(_axes(above, last), title)
     _add_paths(above, episode)
-    labels = []
+    labels, held = [], [holders(scene) for scene in episode.scenes[1:]]
     for row, k in enumerate(wanted):
         x, y = last.bodies[k].position
         reach = last.bodies[k].reach or 0.0
         above.add_patch(Circle((x, y), reach, fill=False, edgecolor="#404040", linestyle=":", zorder=6))
-        above.annotate(f"{row + 1}", (x, y), (7, 7), textcoords="offset points", bbox=_NUMBER, zorder=7)
-        colors = [_covered_by(scene, k) for scene in episode.scenes[1:]]
-        share = sum(color is not None for color in colors) / max(1, episode.steps)
-        labels.append(f"{last.bodies[k].label or 'body'} {row + 1}: {share:.0%}")
-        start = 0
-        for color, run in groupby(colors):
-            length = len(list(run))
-            if color is not None:
-                below.barh(row, length * period_s, left=start * period_s, color=color, height=0.7)
-            start += length
-    below.set(xlim=(0, episode.steps * period_s), xlabel="time (s): when it is covered, and by whom")
+        number = f" {row + 1}" if len(wanted) > 1 else ""
+        above.annotate(number.strip(), (x, y), (7, 7), textcoords="offset points", bbox=_NUMBER, zorder=7)
+        by = [now.get(k) for now in held]
+        share = sum(holder is not None for holder in by) / max(1, episode.steps)
+        labels.append(f"{last.bodies[k].label or 'body'}{number}: {share:.0%}")
+        _add_spans(below, row, [None if holder is None else last.bodies[holder] for holder in by], period_s)
+    what = last.bodies[wanted[0]].held
+    below.set(xlim=(0, episode.steps * period_s), xlabel=f"time (s): when it is {what}, and by whom")
     below.set_yticks(range(len(wanted)), labels)
     below.invert_yaxis()
     below.grid(axis="x", color=GRID)
     below.set_axisbelow(True)
     below.spines[["top", "right"]].set_visible(False)
     _add_legend(figure, last, started=True)
-    return figure
 
 
-def _covered_by(scene: Scene, index: int) -> str | None:
-    """Return the colour of the nearest body with a path, or None where none is within reach."""
-    body = scene.bodies[index]
-    apart = [(math.dist(other.position, body.position), other.color) for other in scene.bodies if other.trail]
-    distance, color = min(apart, default=(math.inf, ""))
-    return color if distance < (body.reach or 0.0) else None
+def _add_spans(axes: Axes, row: int, holders: Sequence[Body | None], period_s: float) -> None:
+    """Add a bar for each time in which one body holds another, in its colour and with its letter."""
+    start = 0
+    for who, run in groupby(holders):
+        length = len(list(run))
+        if who is not None:
+            axes.barh(row, length * period_s, left=start * period_s, color=who.color, height=0.7)
+            middle = ((start + length / 2) * period_s, row)
+            axes.annotate(who.name, middle, color=ink(who.color), ha="center", va="center", fontsize="small")
+        start += length
 
 
-def strip(episode: Episode, title: str, size: int, period_s: float) -> Figure:
+def strip(figure: SubFigure, episode: Episode, title: str, period_s: float) -> None:
     """Draw the last steps of an episode side by side, with arrows from where bodies were a step before."""
     first = max(0, episode.steps - _PANELS + 1)
     rows = math.ceil((episode.steps - first + 1) / _COLUMNS)
-    height = 0.75 + rows * (_INCHES / _COLUMNS + 0.15)
-    figure = Figure(figsize=(_INCHES, height), dpi=size / _INCHES, layout="constrained")
     figure.suptitle(title, x=0.02, ha="left", fontsize="medium", fontweight="bold", parse_math=False)
     panels = figure.subplots(rows, _COLUMNS, squeeze=False).flat
     for k, axes in zip(range(first, first + rows * _COLUMNS), panels, strict=True):
@@ -109,13 +126,12 @@ def strip(episode: Episode, title: str, size: int, period_s: float) -> Figure:
         _axes(axes, scene).set(xlabel="", ylabel="", xticklabels=[], yticklabels=[])
         axes.set_title(f"{k * period_s:g} s{', end' if k == episode.steps else ''}", fontsize="small")
         for body in scene.bodies:
-            _add_body(axes, body)
+            _add_body(axes, body, small=True)
         for before, body in zip(episode.scenes[max(0, k - 1)].bodies, scene.bodies, strict=True):
             if 0 < math.dist(before.position, body.position) <= 2 * scene.grid[0]:  # not round the torus
                 arrow = {"arrowstyle": "->", "color": body.color, "linewidth": 1.2}
                 axes.annotate("", body.position, before.position, arrowprops=arrow, zorder=2)
     _add_legend(figure, episode.scenes[-1], started=False)
-    return figure
 
 
 def _title(axes: Axes, title: str) -> None:
@@ -142,17 +158,22 @@ def _add_paths(axes: Axes, episode: Episode) -> None:
         _add_body(axes, body)
     for body, path in trails(last, episode.scenes[:-1]):
         strength = np.linspace(*_OPACITY, len(path) - 1)
-        ways = LineCollection(list(pairwise(path)), colors=body.color, alpha=strength, linewidths=2.5, zorder=2)
-        ways.set_capstyle("butt")  # others overlap where pieces meet, which shows as dots
+        shades = 1 - strength[:, None] * (1 - np.array(to_rgb(body.color)))  # opaque: nothing shows where pieces meet
+        ways = LineCollection(list(pairwise(path)), colors=shades, linewidths=2.5, capstyle="round", zorder=2)
         axes.add_collection(ways)
         axes.plot(*path[0], "o", color=body.color, markeredgecolor="white", markersize=7, zorder=4)
 
 
-def _add_legend(figure: Figure, scene: Scene, *, started: bool) -> None:
+def _width(figure: FigureBase) -> float:
+    return float(figure.bbox.width) / figure.dpi
+
+
+def _add_legend(figure: SubFigure, scene: Scene, *, started: bool) -> None:
     entries = [_entry(mark) for mark in marks(scene)]
     if started:
         entries.append(Line2D([], [], ls="", label="start", marker="o", color="#606060", mec="white", ms=7))
-    figure.legend(handles=entries, loc="outside lower center", ncols=max(1, len(entries)), frameon=False)
+    columns = max(1, min(len(entries), round(_ENTRIES_PER_INCH * _width(figure))))
+    figure.legend(handles=entries, loc="outside lower center", ncols=columns, frameon=False)
 
 
 def _entry(mark: Mark) -> Line2D:
@@ -165,9 +186,21 @@ def _entry(mark: Mark) -> Line2D:
     return entry
 
 
-def _add_body(axes: Axes, body: Body) -> None:
+def _add_body(axes: Axes, body: Body, small: bool = False) -> None:
     """Add a body in the shapes of `esp_envs.drawing`; crosses lie above the others, so that none hides them."""
     (x, y), r = body.position, body.radius
+    if body.name and body.shape == "disc":
+        on = 2 * r / np.ptp(axes.get_xlim()) * _width(axes.figure) / (_COLUMNS if small else 1) > _LEAST_LETTER
+        place = {"xytext": (0, 0) if on else (6, 6), "textcoords": "offset points", "ha": "center", "va": "center"}
+        shift = 0.45 * r if on else 0.0  # crosses lie in the middle
+        axes.annotate(
+            body.name,
+            (x - shift, y - shift),
+            color=ink(body.color) if on else DARK,
+            fontsize="small",
+            zorder=6,
+            **place,
+        )
     if body.shape == "cross":
         across, up = [x - r, x + r, np.nan, x - r, x + r], [y - r, y + r, np.nan, y + r, y - r]
         axes.plot(across, up, color="white", lw=4.5, zorder=5)

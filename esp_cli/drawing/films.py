@@ -14,13 +14,13 @@ import imageio.v3 as iio
 import numpy as np
 from imageio.v2 import get_writer
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 from scipy.spatial import cKDTree
 
 from esp_cli.drawing.recording import Moment
 from esp_cli.files.writing import write_file
-from esp_envs.drawing import TopPainter
-from esp_envs.scene import Painter, Scene
+from esp_envs.drawing import TopPainter, font
+from esp_envs.scene import DARK, Painter, Scene
 
 Frame = NDArray[np.uint8]
 LEAST_WIDTH = 200  # pixels; narrower pictures have no room for text
@@ -66,16 +66,17 @@ def frame(painter: Painter, moments: Sequence[Moment], left: str, time_s: float)
     flat = flat and moments[0].scene.picture is None
     if flat:
         pictures = [_with_axes(picture, moment.scene, size) for picture, moment in zip(pictures, moments, strict=True)]
-    time = f"{time_s:.1f} s"
+    time, end = f"{time_s:.1f} s", ""
     if len(moments) > 1:
-        named = [_bar(p.shape[1], size, str(m.name), _total(m)) for p, m in zip(pictures, moments, strict=True)]
+        named = [_bar(p.shape[1], size, str(m.name), _total(m), m.end) for p, m in zip(pictures, moments, strict=True)]
         pictures = [np.concatenate(parts) for parts in zip(named, pictures, strict=True)]
     else:
-        time = f"{time}, {_total(moments[0])}"
+        time, end = f"{time}, {_total(moments[0])}", moments[0].end
     body = beside(pictures, _GAP)
     scene = moments[0].scene
-    legend = _legend(marks(scene), body.shape[1], size, _scale(scene, flat))
-    return np.concatenate([_bar(body.shape[1], size, left, time), body, legend])
+    held = dict.fromkeys(Mark(body.held, "ring", (DARK,)) for body in scene.bodies if body.reach is not None)
+    legend = _legend((*marks(scene), *(held if flat else ())), body.shape[1], size, _scale(scene, flat))
+    return np.concatenate([_bar(body.shape[1], size, left, time, end), body, legend])
 
 
 def beside(pictures: Sequence[Frame], gap: int) -> Frame:
@@ -137,16 +138,13 @@ def _scale(scene: Scene, flat: bool) -> str:
     return f"floor {x_max - x_min:g} x {y_max - y_min:g} {scene.unit}"
 
 
-@lru_cache(maxsize=8)
-def _font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
-    return ImageFont.load_default(size)
-
-
-def _bar(width: int, size: int, left: str, right: str) -> Frame:
-    image = Image.new("RGB", (width, round(_BAR * size)), _PAPER)
+def _bar(width: int, size: int, left: str, right: str, end: str = "") -> Frame:
+    """Write a line of text; at an end it is white on dark and says so."""
+    paper, text = (_TEXT, _PAPER) if end else (_PAPER, _TEXT)
+    image = Image.new("RGB", (width, round(_BAR * size)), paper)
     draw, middle = ImageDraw.Draw(image), image.height / 2
-    draw.text((size / 2, middle), left, _TEXT, _font(size), anchor="lm")
-    draw.text((width - size / 2, middle), right, _TEXT, _font(size), anchor="rm")
+    draw.text((size / 2, middle), left, text, font(size), anchor="lm")
+    draw.text((width - size / 2, middle), ", ".join(filter(None, (right, end))), text, font(size), anchor="rm")
     return np.asarray(image)
 
 
@@ -154,13 +152,13 @@ def _bar(width: int, size: int, left: str, right: str) -> Frame:
 def _legend(entries: tuple[Mark, ...], width: int, size: int, note: str) -> Frame:
     fine = size * _OVERSAMPLING
     image = Image.new("RGB", (width * _OVERSAMPLING, round(_BAR * size) * _OVERSAMPLING), _PAPER)
-    draw, font = ImageDraw.Draw(image), _font(fine)
+    draw, letters = ImageDraw.Draw(image), font(fine)
     x, y, r = fine / 2, image.height / 2, 0.4 * fine
     for mark in entries:
         _draw_mark(draw, mark, (x, y - r, x + 2 * r, y + r))
-        draw.text((x + 2.6 * r, y), mark.label, _TEXT, font, anchor="lm")
-        x += 2.6 * r + draw.textlength(mark.label, font) + fine
-    draw.text((image.width - fine / 2, y), note, _FAINT, font, anchor="rm")
+        draw.text((x + 2.6 * r, y), mark.label, _TEXT, letters, anchor="lm")
+        x += 2.6 * r + draw.textlength(mark.label, letters) + fine
+    draw.text((image.width - fine / 2, y), note, _FAINT, letters, anchor="rm")
     return np.asarray(image.resize((width, image.height // _OVERSAMPLING), Image.Resampling.BOX))
 
 
@@ -188,13 +186,13 @@ def _with_axes(picture: Frame, scene: Scene, size: int) -> Frame:
     side, below = round(_SIDE * size), round(_TICKS * size)
     image = Image.new("RGB", (width + side, height + below), _PAPER)
     image.paste(Image.fromarray(picture), (side, 0))
-    draw, font, scale = ImageDraw.Draw(image), _font(size), width / (x_max - x_min)
+    draw, letters, scale = ImageDraw.Draw(image), font(size), width / (x_max - x_min)
     for x in _ticks(x_min, x_max, scene.grid[0], scale, size):
         place = min(side + (x - x_min) * scale, side + width - 0.8 * size)
-        draw.text((place, height + below / 2), f"{x:g}", _FAINT, font, anchor="mm")
+        draw.text((place, height + below / 2), f"{x:g}", _FAINT, letters, anchor="mm")
     for y in _ticks(y_min, y_max, scene.grid[0], scale, size):
         place = min(max((y_max - y) * scale, 0.6 * size), height - 0.6 * size)
-        draw.text((side - 0.4 * size, place), f"{y:g}", _FAINT, font, anchor="rm")
+        draw.text((side - 0.4 * size, place), f"{y:g}", _FAINT, letters, anchor="rm")
     return np.asarray(image)
 
 

@@ -14,7 +14,7 @@ from esp_envs.errors import UserError
 from esp_envs.scene import Scene
 
 FILM_SECONDS = 8.0  # short episodes follow each other until a film lasts about this long
-HOLD_SECONDS = 0.6  # for which a film shows how an episode ended
+HOLD_SECONDS = 1.0  # for which a film shows how an episode ended
 _MARGIN = 0.02  # share of a window by which bodies may leave it before it grows
 
 
@@ -25,6 +25,7 @@ class Moment:
     scenes: Sequence[Scene]  # of the episode until now
     total: float  # return until now
     name: str | None = None  # of the policy where two are compared, else None
+    end: str = ""  # what a film says where the episode has ended
 
     @property
     def scene(self) -> Scene:
@@ -37,6 +38,7 @@ class Episode:
 
     scenes: Sequence[Scene]  # its start and every step, up to the one that ends it
     returns: Sequence[float]  # mean return of the agents until each scene
+    end: str = "end"  # how it ended
 
     @property
     def steps(self) -> int:
@@ -45,7 +47,7 @@ class Episode:
     def moment(self, step: int, name: str | None = None) -> Moment:
         """Return the episode until a step, or until its end where that comes first."""
         step = min(step, self.steps)
-        return Moment(self.scenes[: step + 1], self.returns[step], name)
+        return Moment(self.scenes[: step + 1], self.returns[step], name, self.end if step == self.steps else "")
 
 
 def record(policies: Sequence[TrainedPolicy], episodes: int | None = None, greedy: bool = True) -> list[list[Episode]]:
@@ -80,7 +82,7 @@ def _long_enough(recorded: Sequence[Episode], period_s: float) -> bool:
 def _play(controller: PolicyController, env: Environment) -> Episode:
     observation = env.reset()
     controller.begin(env, observation)
-    scenes, returns = [env.scene()], [0.0]
+    scenes, returns, end = [env.scene()], [0.0], "end"
     for _ in range(env.spec.horizon):
         step = env.step(controller.act(env, observation))
         observation = step.next
@@ -90,8 +92,9 @@ def _play(controller: PolicyController, env: Environment) -> Episode:
         scenes.append(scenes[-1] if ended and not env.has("set_state") else env.scene())
         returns.append(returns[-1] + float(step.reward.mean(-1)[0, 0]))
         if ended:
+            end = f"end: {env.ending}" if bool(step.terminated[0, 0]) else end
             break
-    return Episode(scenes, returns)
+    return Episode(scenes, returns, end)
 
 
 def framed(recorded: Sequence[Sequence[Episode]]) -> list[list[Episode]]:

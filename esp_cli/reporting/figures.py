@@ -1,7 +1,7 @@
 """Figures: how one is written, and those of returns, as means with every seed or over a setting.
 
-Each is written as PNG and as SVG, the same bytes for the same numbers. Colours are those of Okabe and Ito, which
-people with any common colour blindness can tell apart; curves differ in their line style too.
+Each is written as PNG and as SVG, for print as PDF too, the same bytes for the same numbers. Colours are those of
+films, which the colour-blind tell apart; curves differ in their line style too.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib as mpl
 import numpy as np
@@ -21,13 +21,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
+from esp_cli.drawing.figures import PAPER, PAPER_DPI, STEADY, UNDATED
 from esp_cli.files.formatting import attempting, format_span
 from esp_cli.files.writing import write_file
 from esp_cli.policies.statistics import bootstrap_interval, mean_and_sem
 from esp_envs.errors import UserError
-
-PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
-"""Okabe and Ito, "Color Universal Design", 2008, without the yellow, too light for lines on white, and a grey."""
+from esp_envs.scene import COLORS
 
 LineStyle = str | tuple[int, tuple[int, ...]]
 
@@ -43,11 +42,12 @@ _STYLE: dict[Any, Any] = {
     "grid.color": "#E5E5E5",
     "axes.axisbelow": True,
     "legend.frameon": False,
-    # names are not mathematics: a dollar sign stays one
-    "text.parse_math": False,
-    # identifiers in SVG files are drawn at random unless salted
-    "svg.hashsalt": "esp",
+    **STEADY,
 }
+Style = Literal["screen", "paper"]
+COLUMN, PAGE = 3.5, 7.2  # width of a figure for print, of one column or two, inches
+_ONE_COLUMN, _LEAST_SHARE = 7.5, 0.6
+"""Width up to which a figure takes one column in print, inches, and the least share of its height that it keeps."""
 _JITTER = 0.08  # horizontal distance of the lines of `over_setting`, so that intervals do not lie upon each other
 _WIDEST = 0.4  # all lines together, at one value
 POINTS_PER_INCH = 72  # of an SVG by matplotlib
@@ -68,6 +68,7 @@ def dots(
     title: str,
     xlabel: str,
     anchors: Mapping[str, float] | None = None,
+    style: Style = "screen",
 ) -> Picture:
     """Draw the mean of each group as a dot with its interval, and every seed as a small one.
 
@@ -79,11 +80,12 @@ def dots(
         title: heading.
         xlabel: what is plotted, with its convention.
         anchors: lines where they are in view: name -> value; the legend names the others.
+        style: as of `written_figure`.
     """
-    with written_figure(path, (7.2, 2.1 + 0.5 * len(groups))) as (figure, picture):
+    with written_figure(path, (7.2, 2.1 + 0.5 * len(groups)), style) as (figure, picture):
         axes = _titled(figure, title)
         for index, group in enumerate(groups.values()):
-            colour, values = PALETTE[index % len(PALETTE)], np.asarray(group, dtype=np.float64)
+            colour, values = COLORS[index % len(COLORS)], np.asarray(group, dtype=np.float64)
             mean, _ = mean_and_sem(values)
             # a fixed spread instead of a random one keeps the seeds apart and the file the same
             spread = np.linspace(-0.18, 0.18, values.size) if values.size > 1 else np.zeros(1)
@@ -100,8 +102,8 @@ def dots(
         low, high = axes.get_xlim()
         for index, (name, value) in enumerate((anchors or {}).items()):
             if low <= value <= high:
-                style = _LINE_STYLES[(index + 1) % len(_LINE_STYLES)]
-                axes.axvline(value, linestyle=style, color="#777777", linewidth=1.2, label=f"{name} {value:g}")
+                dashes = _LINE_STYLES[(index + 1) % len(_LINE_STYLES)]
+                axes.axvline(value, linestyle=dashes, color="#777777", linewidth=1.2, label=f"{name} {value:g}")
             else:
                 axes.plot([], [], " ", label=f"{name} {value:g} (out of view)")
         axes.set_xlim(low, high)
@@ -119,6 +121,7 @@ def over_setting(
     labels: tuple[str, str],
     order: Iterable[str] = (),
     paper: Mapping[str, Mapping[str, float]] | None = None,
+    style: Style = "screen",
 ) -> Picture:
     """Draw returns over a setting as lines with intervals, and the paper's means as crosses.
 
@@ -129,17 +132,18 @@ def over_setting(
         labels: of the axes: the setting, whose values stand at equal distances as in figure 5c, and what is plotted.
         order: the setting's values from left to right, where not every line has all of them.
         paper: the paper's means: name -> value of the setting -> mean.
+        style: as of `written_figure`.
     """
     known = dict.fromkeys(value for line in lines.values() for value in line)
     places = {value: k for k, value in enumerate(v for v in dict.fromkeys([*order, *known]) if v in known)}
     apart = min(_JITTER, _WIDEST / len(lines))
-    with written_figure(path, (6.4, 4.4)) as (figure, picture):
+    with written_figure(path, (6.4, 4.4), style) as (figure, picture):
         axes = _titled(figure, title)
         for index, (name, line) in enumerate(lines.items()):
-            colour, style = appearance(index)
+            colour, dashes = appearance(index)
             at = [places[value] + apart * (index - (len(lines) - 1) / 2) for value in line]
             means = [mean_and_sem(values)[0] for values in line.values()]
-            axes.plot(at, means, color=colour, linestyle=style, marker="o", label=name)
+            axes.plot(at, means, color=colour, linestyle=dashes, marker="o", label=name)
             for x, values in zip(at, line.values(), strict=True):
                 if (interval := bootstrap_interval(values)) is not None:
                     axes.plot([x, x], interval, color=colour, linewidth=1.6)
@@ -156,22 +160,30 @@ def over_setting(
 
 def appearance(index: int) -> tuple[str, LineStyle]:
     """Return the colour and the line style of the curve with this index."""
-    return PALETTE[index % len(PALETTE)], _LINE_STYLES[index % len(_LINE_STYLES)]
+    return COLORS[index % len(COLORS)], _LINE_STYLES[index % len(_LINE_STYLES)]
 
 
 @contextmanager
-def written_figure(path: str | os.PathLike[str], size: tuple[float, float]) -> Iterator[tuple[Figure, Picture]]:
-    """Set up a figure of a size in inches and write it at the end, as PNG and as SVG."""
+def written_figure(
+    path: str | os.PathLike[str], size: tuple[float, float], style: Style = "screen"
+) -> Iterator[tuple[Figure, Picture]]:
+    """Set up a figure of a size in inches and write it at the end, as PNG and as SVG.
+
+    For print it is a column or a page wide instead, with small letters, and a PDF too.
+    """
     path = Path(path)
-    stem = path.stem if path.suffix in {".png", ".svg"} else path.name
+    stem = path.stem if path.suffix in {".png", ".svg", ".pdf"} else path.name
     png, svg = path.with_name(f"{stem}.png"), path.with_name(f"{stem}.svg")
-    with mpl.rc_context(_STYLE):
+    for_print = style == "paper"
+    if for_print:
+        share = (PAGE if size[0] > _ONE_COLUMN else COLUMN) / size[0]
+        size = (size[0] * share, size[1] * max(share, _LEAST_SHARE))
+    with mpl.rc_context({**_STYLE, **(PAPER | {"savefig.dpi": PAPER_DPI} if for_print else {})}):
         figure = Figure(figsize=size, layout="constrained")
         yield figure, Picture(png, svg, (size[0] * POINTS_PER_INCH, size[1] * POINTS_PER_INCH))
-        # dates and versions would make every file differ from the last
-        for file, metadata in ((png, {"Software": None}), (svg, {"Date": None, "Creator": None})):
-            content = BytesIO()
-            figure.savefig(content, format=file.suffix[1:], metadata=metadata)
+        for file in (png, svg, *([png.with_suffix(".pdf")] if for_print else [])):
+            content, kind = BytesIO(), file.suffix[1:]
+            figure.savefig(content, format=kind, metadata=UNDATED[kind])
             with attempting("write the figure", file, UserError):
                 write_file(file, content.getvalue())
 

@@ -29,6 +29,7 @@ from esp_cli.files.writing import replace_file, write_file
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.policies.statistics import steps_to_threshold
 from esp_cli.reporting.collect import Material
+from esp_cli.reporting.figures import Style
 from esp_cli.reporting.results import RESULTS_FORMAT, CellResult, Results, Side
 from esp_cli.reporting.study_figures import draw_curves, draw_variants
 from esp_cli.reporting.tables import all_tables, markdown_text
@@ -46,7 +47,7 @@ _MAX_FILM_BYTES = 2**26
 _KEYS = ("run", "seed", "step")
 
 
-def write_report(material: Material, out: Path) -> list[Path]:
+def write_report(material: Material, out: Path, style: Style = "screen") -> list[Path]:
     """Write a report into a folder; return its files: page, Markdown, pictures and results."""
     if not material.curves:
         raise UserError("no run of this study has an evaluation yet; run it first, or wait a little")
@@ -54,10 +55,10 @@ def write_report(material: Material, out: Path) -> list[Path]:
     out.mkdir(parents=True, exist_ok=True)
     # Names in this folder are the program's own: links there are replaced, where drawing would follow them.
     with TemporaryDirectory() as scratch:
-        curves, hovers = draw_curves(material, Path(scratch) / CURVES)
-        pictures = [curves, *draw_variants(material.results, Path(scratch))]
+        curves, hovers = draw_curves(material, Path(scratch) / CURVES, style=style)
+        pictures = [curves, *draw_variants(material.results, Path(scratch), style)]
         images = [(picture.png.stem, _data_uri(picture.svg.read_bytes(), "image/svg+xml")) for picture in pictures]
-        for file in (file for picture in pictures for file in (picture.png, picture.svg)):
+        for file in sorted(Path(scratch).iterdir()):
             replace_file(out / file.name, file.read_bytes())
     tables, study = all_tables(material.results), material.study
     whole = {material.runs.get(cell.name, cell.name): cell for cell in study.cells}  # each run once

@@ -16,7 +16,16 @@ from matplotlib.ticker import EngFormatter
 
 from esp_cli.policies.statistics import Floats, curve_band
 from esp_cli.reporting.collect import Material, RunCurve
-from esp_cli.reporting.figures import POINTS_PER_INCH, Picture, appearance, caption, dots, over_setting, written_figure
+from esp_cli.reporting.figures import (
+    POINTS_PER_INCH,
+    Picture,
+    Style,
+    appearance,
+    caption,
+    dots,
+    over_setting,
+    written_figure,
+)
 from esp_cli.reporting.results import CellResult, Results, floats
 from esp_cli.studies.kinds import UNBROKEN, kind_of
 
@@ -56,7 +65,7 @@ def series_of(results: Results) -> list[Series]:
     return [Series(name, setting, cells) for (name, setting), cells in whole.items()]
 
 
-def draw_curves(material: Material, path: Path) -> tuple[Picture, tuple[Hover, ...]]:
+def draw_curves(material: Material, path: Path, style: Style = "screen") -> tuple[Picture, tuple[Hover, ...]]:
     """Draw the learning curves by panel, with the anchors of a run that has its final evaluation."""
     entries = {entry.name: entry for entry in material.results.cells}
     panels: dict[tuple[int, ...], Panel] = {}
@@ -73,25 +82,25 @@ def draw_curves(material: Material, path: Path) -> tuple[Picture, tuple[Hover, .
             panels.setdefault(tuple(map(id, drawn)), Panel(title, drawn, anchors))
     conventions = {entry.convention for entry in entries.values() if entry.convention}
     convention = f" ({conventions.pop()})" if len(conventions) == 1 and len(panels) == 1 else ""
-    return learning_curves([*panels.values()], path, f"{material.results.mode} return{convention}")
+    return learning_curves([*panels.values()], path, f"{material.results.mode} return{convention}", style)
 
 
-def draw_variants(results: Results, out: Path) -> list[Picture]:
+def draw_variants(results: Results, out: Path, style: Style = "screen") -> list[Picture]:
     """Draw the returns of a study of variants into a folder, over what it varies where that has an order."""
     if results.rows == "panels":
         return []
     if results.kind == "ablate-coefficient" or kind_of(results.kind).breakings:
         stem = "coefficient" if results.kind == "ablate-coefficient" else "breaking"
-        return draw_over_setting(results, out / stem)
+        return draw_over_setting(results, out / stem, style)
     pictures = []
     for k, (panel, cells) in enumerate(_finished(results).items(), 1):
         groups = {variant: floats(cell.returns[results.mode]) for variant, cell in cells.items()}
         anchors = {key: round(value, 1) for key, value in next(iter(cells.values())).anchors.items()}
-        pictures.append(dots(groups, out / f"returns-{k}", panel, f"{results.mode} return", anchors))
+        pictures.append(dots(groups, out / f"returns-{k}", panel, f"{results.mode} return", anchors, style))
     return pictures
 
 
-def draw_over_setting(results: Results, path: Path) -> list[Picture]:
+def draw_over_setting(results: Results, path: Path, style: Style = "screen") -> list[Picture]:
     """Draw returns over the weight of the consistency loss, or over strengths of breaking: `path`-1, `path`-2."""
     label, mode = f"{results.mode} return", results.mode
     if results.kind == "ablate-coefficient":
@@ -101,7 +110,7 @@ def draw_over_setting(results: Results, path: Path) -> list[Picture]:
         }
         paper = {p: {name: cell.paper[0] for name, cell in own.items() if cell.paper} for p, own in panels.items()}
         title, order = "Return over the weight of the consistency loss", [cell.variant for cell in results.cells]
-        return [over_setting(lines, path, title, ("weight", label), order, paper)] if lines else []
+        return [over_setting(lines, path, title, ("weight", label), order, paper, style)] if lines else []
     pictures = []
     for k, one in enumerate(series_of(results), 1):
         lines = {}
@@ -112,7 +121,7 @@ def draw_over_setting(results: Results, path: Path) -> list[Picture]:
         if lines:
             order, title = [f"{strength:g}" for strength in one.cells], f"{one.name}, {one.setting}"
             target = path.with_name(f"{path.name}-{k}")
-            pictures.append(over_setting(lines, target, title, (one.setting, label), order))
+            pictures.append(over_setting(lines, target, title, (one.setting, label), order, style=style))
     return pictures
 
 
@@ -135,7 +144,7 @@ class Hover:
 
 
 def learning_curves(
-    panels: Sequence[Panel], path: str | os.PathLike[str], ylabel: str
+    panels: Sequence[Panel], path: str | os.PathLike[str], ylabel: str, style: Style = "screen"
 ) -> tuple[Picture, tuple[Hover, ...]]:
     """Draw means over seeds with their 95 % bootstrap intervals, in panels with one legend, as in the paper's figure 4.
 
@@ -146,7 +155,7 @@ def learning_curves(
     columns = min(len(panels), _MAX_COLUMNS)
     rows = math.ceil(len(panels) / columns)
     width, height = _ONE_PANEL if len(panels) == 1 else _PANEL
-    with written_figure(path, (max(columns * width, 6.0), rows * height + _LEGEND_INCHES)) as (figure, picture):
+    with written_figure(path, (max(columns * width, 6.0), rows * height + _LEGEND_INCHES), style) as (figure, picture):
         grid = figure.subplots(rows, columns, squeeze=False)
         drawn = []
         for axes, panel in zip(grid.flat, panels, strict=False):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -46,6 +47,26 @@ def test_the_policy_beside_acts_by_the_same_seed_or_not_at_all(finished: Path, t
     words = ("render", finished, others, "-o", tmp_path / "film.gif", "--episodes", 1, "--size", 48)
     esp(*words, "--seed", 3)
     assert "has no seed 7; it has 3, 5" in refused(*words, "--seed", 7)
+
+
+def test_a_picture_for_print_is_as_wide_as_asked_for_and_has_its_letters_embedded(
+    finished: Path, tmp_path: Path
+) -> None:
+    for kind in ("pdf", "svg", "png"):
+        esp("render", finished, "-o", tmp_path / f"column.{kind}", "--width", 89)
+    points = 89 / 25.4 * 72
+    pdf = (tmp_path / "column.pdf").read_bytes()
+    (box,) = re.findall(rb"/MediaBox \[ 0 0 ([\d.]+) ", pdf)
+    assert float(box) == pytest.approx(points)
+    assert b"/FontFile2" in pdf
+    assert b"/Type3" not in pdf, "no editor knows letters of that kind"
+    assert f'width="{points:.3f}'[:-1] in (tmp_path / "column.svg").read_text()
+    with Image.open(tmp_path / "column.png") as picture:
+        assert picture.width == round(89 / 25.4 * 300)
+    first = pdf
+    esp("render", finished, "-o", tmp_path / "column.pdf", "--width", 89)
+    assert (tmp_path / "column.pdf").read_bytes() == first, "no date in it"
+    assert "leave out --width" in refused("render", finished, "-o", tmp_path / "film.gif", "--width", 89)
 
 
 def test_frames_per_second_of_a_picture_are_refused(finished: Path, tmp_path: Path) -> None:
@@ -176,7 +197,7 @@ def test_predators_and_prey_are_drawn_from_a_policy_file(tmp_path: Path) -> None
 @pytest.mark.parametrize("name", ["film.mov", "film.jpg", "film", "gif"])
 def test_another_kind_of_file_is_refused(finished: Path, tmp_path: Path, name: str) -> None:
     sentence = refused("render", finished, "-o", tmp_path / name)
-    assert sentence == f"cannot write {tmp_path / name}: name a .gif, .mp4 or .png file"
+    assert sentence == f"cannot write {tmp_path / name}: name a .gif or .mp4 film, or a .png, .pdf or .svg picture"
     assert not (tmp_path / name).exists()
 
 

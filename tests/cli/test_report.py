@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import shlex
 from pathlib import Path
 
@@ -119,6 +120,20 @@ def test_page_markdown_results_and_terminal_compare_at_the_same_step(
     at = esp("report", f"short={short}", f"ESP={finished}", "--at", "50", "--mode", "stochastic", "--out", out)
     assert "navigation, 50" in at.stdout
     assert "--at 50 --mode stochastic --out " in (out / "report.md").read_text()
+
+
+def test_figures_for_papers_are_a_column_wide_with_embedded_letters(
+    finished: Path, plain: Path, tmp_path: Path
+) -> None:
+    told = esp("report", plain, finished, "--style", "paper", "--out", tmp_path / "out", "--plot", tmp_path / "c.pdf")
+    assert f"curves -> {tmp_path / 'c.pdf'}" in told.stderr
+    for pdf in ((tmp_path / "c.pdf").read_bytes(), (tmp_path / "out" / "curves.pdf").read_bytes()):
+        (width,) = re.findall(rb"/MediaBox \[ 0 0 ([\d.]+) ", pdf)
+        assert float(width) == 3.5 * 72
+        assert b"/FontFile2" in pdf
+        assert b"/Type3" not in pdf
+    esp("report", plain, finished, "--plot", tmp_path / "screen.png")
+    assert not (tmp_path / "screen.pdf").exists()
 
 
 def test_two_runs_of_one_label_are_refused(finished: Path, tmp_path: Path) -> None:

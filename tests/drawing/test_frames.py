@@ -117,3 +117,37 @@ def test_numbers_along_an_axis_keep_apart() -> None:
     assert frames._ticks(-1.0, 1.0, 0.5, 100, 13) == [-1, -0.5, 0, 0.5, 1]
     assert frames._ticks(-1.0, 1.0, 0.5, 40, 13) == [-1, 0, 1]
     assert frames._ticks(-3.5, 3.5, 1.0, 60, 13) == [-3, -2, -1, 0, 1, 2, 3]
+
+
+def test_the_end_of_an_episode_is_white_on_dark_and_says_how_it_ended(written: list[str]) -> None:
+    going, ended = (
+        frame(TopPainter(240), [Moment([TEAM], 1.0, None, end)], "task", 0.5) for end in ("", "end: captured")
+    )
+    assert {"0.5 s, return 1.0", "0.5 s, return 1.0, end: captured"} <= set(written)
+    assert (going[1, 1] > 250).all()
+    assert (ended[1, 1] < 50).all()
+
+
+def test_what_is_covered_is_ringed_and_named(written: list[str]) -> None:
+    landmark = Body((0.0, 0.0), 0.1, BLUE, "cross", reach=0.2, held="covered")
+    near, far = (scene(Body((0.0, y), 0.1, RED, trail=True), landmark) for y in (0.19, 0.2))
+    rings = [(draw(one, 240)[120, 140:150] < 60).all(-1).sum() for one in (near, far)]  # to the right of the cross
+    assert rings[0] > 0
+    assert rings[1] == 0
+    frame(TopPainter(240), [Moment([near], 0.0)], "", 0.0)
+    assert "covered" in written
+
+
+def test_agents_have_letters_on_them_or_beside_them() -> None:
+    def letters(radius: float, name: str = "A", **nose: float) -> set[tuple[int, int]]:
+        pictures = (draw(scene(Body((0.0, 0.0), radius, BLUE, name=n, **nose)), 240) for n in (name, ""))
+        rows, columns = np.nonzero(np.not_equal(*pictures).any(-1))
+        return set(zip((rows - 120).tolist(), (columns - 120).tolist(), strict=True))
+
+    on, small, nose = letters(0.2), letters(0.02), letters(0.2, heading=0.0)
+    assert on
+    assert all(max(abs(row), abs(column)) < 0.2 * 120 for row, column in on)
+    for beside in (small, nose):
+        assert beside
+        assert all(row < 0 < column for row, column in beside)
+    assert not letters(0.2, "")

@@ -13,8 +13,9 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from esp_cli.policies.statistics import curve_band
-from esp_cli.reporting.figures import PALETTE, dots, over_setting
+from esp_cli.reporting.figures import dots, over_setting
 from esp_cli.reporting.study_figures import Panel, _draw_levels, learning_curves
+from esp_envs.scene import COLORS
 
 Curve = namedtuple("Curve", ("label", "steps", "values"))
 
@@ -95,7 +96,7 @@ def test_curves_show_the_mean_over_seeds_in_colours_apart(tmp_path, drawn):
     plain, ours = lines["MAPPO"], lines["MAPPO-ESP"]
     np.testing.assert_allclose(ours.get_ydata(), [-215.0, -146.0, -121.0])
     np.testing.assert_allclose(plain.get_ydata(), [-225.0, -156.0, -131.0])
-    assert (plain.get_color(), ours.get_color()) == PALETTE[:2]
+    assert (plain.get_color(), ours.get_color()) == COLORS[:2]
     assert plain.get_linestyle() != ours.get_linestyle()
     assert len(axes.collections) == 2
     assert {text.get_text() for text in axes.texts} == {"random", "paper, heuristic"}
@@ -169,7 +170,7 @@ def test_panels_share_a_legend_and_each_has_its_title_and_anchors(tmp_path):
     assert all(part in text for part in ("navigation, 500k", "formation", "greedy return", "random"))
     assert "far off" not in text, "it would squeeze the curves"
     assert text.count("<!-- MAPPO-ESP -->") == 1
-    assert text.count(PALETTE[1].lower()) >= 2, "one label, one colour in both panels"
+    assert text.count(COLORS[1].lower()) >= 2, "one label, one colour in both panels"
     assert "<!-- mean and 95 % bootstrap interval over 1 to 2 seeds -->" in text
 
 
@@ -205,7 +206,7 @@ def test_the_pointer_is_shown_the_evaluations_where_they_were_drawn(tmp_path, dr
     panels = [Panel("p", [RISING]), Panel("q", [FLAT, RISING])]
     picture, (hover, other) = learning_curves(panels, tmp_path / "a", "return")
     ((label, colour, points),) = hover.curves
-    assert (label, colour, [curve[1] for curve in other.curves]) == ("MAPPO", PALETTE[0], [PALETTE[1], PALETTE[0]])
+    assert (label, colour, [curve[1] for curve in other.curves]) == ("MAPPO", COLORS[0], [COLORS[1], COLORS[0]])
     # two seeds lie 1 apart, so that their interval is from one to the other
     assert [point[2:] for point in points] == [[0, 0.5, 0, 1], [100, 2.5, 2, 3], [200, 4.5, 4, 5]]
     (path,) = re.findall(

@@ -204,4 +204,4 @@ def test_a_screenshot_has_the_colours_of_the_curves(page, tmp_path):
     browse(page, tmp_path / "profile", f"--screenshot={picture}")
     with Image.open(picture) as image:
         colours = {colour for _, colour in image.convert("RGB").getcolors(2**24)}
-    assert {(0x00, 0x72, 0xB2), (0xD5, 0x5E, 0x00)} <= colours
+    assert {(0x00, 0x72, 0xB2), (0xE6, 0x9F, 0x00)} <= colours

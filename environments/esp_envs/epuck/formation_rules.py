@@ -11,7 +11,7 @@ import numpy as np
 
 from esp_envs.epuck.formation_spec import FormationSettings
 from esp_envs.epuck.robot import BODY_RADIUS_M, MAX_SPEED_M_S, MAX_SPIN_RAD_S, Array, Flags
-from esp_envs.scene import COLORS, Body, Scene
+from esp_envs.scene import PALE, Body, Scene, look
 
 FADING_M = 0.2  # gap over which the sight `nearness` of a body fades to 1/e
 RISKY_GAP_M = 0.05  # gap between two robots below which a state is risky (supplement of the paper)
@@ -20,7 +20,6 @@ SIGHT_M = 0.25
 """Gap between bodies below which one gives way to the other; this and the weights below were found by search."""
 PUSH = 1.0  # weight of moving away from a near body, against 1 for moving to the goal
 SWERVE = 1.5  # weight of passing a near body on the right
-_PILLAR_COLOR = "#707070"
 
 
 def length(offset: Array) -> Array:
@@ -99,11 +98,12 @@ def formation_scene(
     """Return goals [N, 2], pillars [M, 2] and robots, at positions [N, 2] with headings [N], of one world."""
     bodies = []
     for i, goal in enumerate(goals.tolist()):
-        bodies.append(Body(tuple(goal), BODY_RADIUS_M, COLORS[i % len(COLORS)], "ring", model="goal", label="goal"))
+        own = look(i)
+        bodies.append(Body(tuple(goal), BODY_RADIUS_M, shape="ring", model="goal", label="goal", **own))
     radius = settings.obstacle_radius_m
-    bodies += [Body(tuple(place), radius, _PILLAR_COLOR, model="pillar", label="pillar") for place in pillars.tolist()]
+    bodies += [Body(tuple(place), radius, PALE, model="pillar", label="pillar") for place in pillars.tolist()]
     for i, (place, turn) in enumerate(zip(position.tolist(), heading.tolist(), strict=True)):
-        color = COLORS[i % len(COLORS)]
-        bodies.append(Body(tuple(place), BODY_RADIUS_M, color, "disc", turn, trail=True, model="robot", label="robot"))
+        robot = Body(tuple(place), BODY_RADIUS_M, heading=turn, trail=True, model="robot", label="robot", **look(i))
+        bodies.append(robot)
     half = settings.arena.side_m / 2
     return Scene(tuple(bodies), (-half, half, -half, half), unit="m")

@@ -16,7 +16,7 @@ from esp_envs.mpe import covering
 from esp_envs.mpe.many import MOST_BODIES, ManyWorlds
 from esp_envs.mpe.particles import Bodies, ParticleWorlds
 from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings, ParticleTask
-from esp_envs.scene import COLORS, Body, Scene
+from esp_envs.scene import DARK, Body, Scene, look
 from esp_envs.spec import Field, Items, Kind, TaskSpec, filled_layout, layout
 
 AGENT_RADIUS = 0.15
@@ -24,7 +24,6 @@ _LANDMARK_RADIUS = 0.05  # for drawing only: landmarks touch nothing
 SENSITIVITY = 5.0  # acceleration of a full force, length / s^2
 OCCUPIED_WITHIN = 0.1  # a landmark counts as covered when an agent's centre is nearer than this (mpe2's capture radius)
 LANDMARK_EXTENT = {"esp": 0.8, "pettingzoo": 1.0}
-_LANDMARK_COLOR = "#404040"
 
 
 class NavigationSettings(ParticleSettings):
@@ -234,11 +233,10 @@ class Navigation(ParticleTask):
         places = self.worlds.entity[:, :, lane].tolist()
         agents = self.settings.num_agents
         bodies = [
-            Body((x, y), AGENT_RADIUS, color, trail=True, label="agent")
-            for (x, y), color in zip(places[:agents], itertools.cycle(COLORS), strict=False)
+            Body((x, y), AGENT_RADIUS, trail=True, label="agent", **look(k)) for k, (x, y) in enumerate(places[:agents])
         ]
         bodies += [
-            Body((x, y), _LANDMARK_RADIUS, _LANDMARK_COLOR, "cross", label="landmark", reach=OCCUPIED_WITHIN)
+            Body((x, y), _LANDMARK_RADIUS, DARK, "cross", label="landmark", reach=OCCUPIED_WITHIN)
             for x, y in places[agents:]
         ]
         half = 1.4 * self.settings.half_side

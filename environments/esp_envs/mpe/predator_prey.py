@@ -15,7 +15,7 @@ from esp_envs.mpe.frozen_prey import FrozenPrey
 from esp_envs.mpe.particles import Bodies
 from esp_envs.mpe.predator_prey_spec import PredatorPreySettings, predator_prey_spec, prey_layout
 from esp_envs.mpe.task import MOVES, ParticleTask, nearest_move, unit_disc
-from esp_envs.scene import Body, Scene
+from esp_envs.scene import COLORS, PALE, Body, Scene, look
 from esp_envs.spec import TaskSpec
 
 PREDATOR_RADIUS, PREY_RADIUS, OBSTACLE_RADIUS = 0.075, 0.05, 0.2
@@ -167,12 +167,13 @@ class PredatorPrey(ParticleTask):
         lane = world[0] * self.num_envs + world[1]
         places = self.worlds.entity[:, :, lane].tolist()
         predators = self.settings.num_predators
-        bodies = [Body((x, y), OBSTACLE_RADIUS, "#808890", label="obstacle") for x, y in places[predators + 1 :]]
-        bodies += [
-            Body((x, y), PREDATOR_RADIUS, "#d84a3f", trail=True, label="predator") for x, y in places[:predators]
-        ]
-        (x, y) = places[predators]
-        bodies.append(Body((x, y), PREY_RADIUS, "#3fa86a", trail=True, label="prey"))
+        bodies = [Body((x, y), OBSTACLE_RADIUS, PALE, label="obstacle") for x, y in places[predators + 1 :]]
+        for k, (x, y) in enumerate(places[:predators]):
+            name = look(k)["name"]
+            bodies.append(Body((x, y), PREDATOR_RADIUS, COLORS[0], trail=True, label="predator", name=name))
+        (x, y), touching = places[predators], PREDATOR_RADIUS + PREY_RADIUS
+        prey = Body((x, y), PREY_RADIUS, COLORS[1], trail=True, label="prey", reach=touching, held="caught")
+        bodies.append(prey)
         return Scene(tuple(bodies), (-1.4, 1.4, -1.4, 1.4), unit="length units")
 
     def _to_save(self) -> dict[str, Tensor]:
