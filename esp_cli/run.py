@@ -23,7 +23,7 @@ from esp_cli.algorithms.learner import Learner
 from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.checking.measured import prepared
 from esp_cli.defaults import EPISODES, STEPS
-from esp_cli.files.formatting import file_name
+from esp_cli.files.formatting import Shown, file_name, format_count
 from esp_cli.machine import resolve_device
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.policies.evaluation import FinalEvaluation
@@ -32,7 +32,7 @@ from esp_cli.policies.loaded import LoadedPolicy, register_own
 from esp_cli.policies.loading import Start, TrainedPolicy
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config
-from esp_cli.training.metrics import Metrics, read_metrics
+from esp_cli.training.metrics import Metrics, read_last_row, read_metrics
 from esp_cli.training.run_folder import RunFolder, RunFolderError
 from esp_cli.training.settings import parse_config
 from esp_cli.training.trackers import require
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from esp_cli.drawing.draw import Drawing, View
 
 
-class Run:
+class Run(Shown):
     """A run in its folder: S seeds of one task, algorithm, network and prior.
 
     Example:
@@ -78,6 +78,17 @@ class Run:
         self.folder = RunFolder.open(Path(path))
         self.path = self.folder.path
         self.config: RunConfig = parse_config(self.folder.config, self.path)
+
+    def _facts(self) -> Mapping[str, object]:
+        config, row = self.config, read_last_row(self.folder.metrics_path)
+        evaluated = {k: v for k, v in self.metrics._facts().items() if k.startswith("eval/return")} if row else {}
+        return {
+            "run": self.path,
+            "what": f"{config.algorithm} on {config.task}, prior {config.prior.kind}, network {config.network.name}",
+            "seeds": ", ".join(map(str, config.seeds)),
+            "steps": f"{format_count(row.get('step', 0))} of {format_count(config.steps)}",
+            **evaluated,
+        }
 
     @property
     def metrics(self) -> Metrics:

@@ -38,7 +38,7 @@ _GROUPS: dict[str, tuple[str, ...]] = {
         "threshold",
     ),
     _PICTURE: ("view", "size", "width", "speed", "fps", "style", "plot", "films"),
-    _OUTPUT: ("out", "force", "json", "csv", "results", "full", "track", "formats", "name"),
+    _OUTPUT: ("out", "force", "json", "csv", "results", "full", "track", "watch", "formats", "name"),
 }
 _MOVED: dict[str, dict[str, str]] = {  # options that belong elsewhere in a command than in the others
     "train": {"task": _TRAINED, "algo": _TRAINED, "network": _TRAINED, "physics": _TRAINED, "prior": _PRIOR},

@@ -21,6 +21,7 @@ from esp_envs.errors import UserError
 if TYPE_CHECKING:
     from esp_cli.run import Run
     from esp_cli.training.config import RunConfig
+    from esp_cli.training.trackers import Guarded, Tracker
     from esp_cli.training.trainer import Progress, Trainer
 
 EPILOG = """Examples:\n
@@ -88,6 +89,10 @@ def train(
             help="Give the metrics to tensorboard, wandb or mlflow too; repeatable. Offline, in the run folder.",
         ),
     ] = None,
+    watch: Annotated[
+        bool,
+        typer.Option("--watch", help="Draw curve and present policy into a page of the run folder, for a browser."),
+    ] = False,
     no_check: options.NoCheckOption = False,
 ) -> None:
     """Train S seeds of one task, algorithm, network and prior at once, with live progress."""
@@ -105,7 +110,7 @@ def train(
     if resume is not None:
         own = {"task": task, "algo": algo, "network": network or ""}
         _refuse_beside_resume(context, allowed=[name for name, value in own.items() if ":" in value])
-        _train(runs.Run(resume), trackers, not no_check)
+        _train(runs.Run(resume), trackers, watch, not no_check)
         return
     require(trackers)
     if prior == "none" and transforms is not None:
@@ -132,7 +137,7 @@ def train(
     if print_config:
         console.write_json("-", RUN_FORMAT.document(resolved.model_dump(mode="json")))
         return
-    _train(runs.begin(resolved, weights, out), trackers, not no_check)
+    _train(runs.begin(resolved, weights, out), trackers, watch, not no_check)
 
 
 def _refuse_beside_resume(context: typer.Context, allowed: Sequence[str]) -> None:
@@ -140,7 +145,7 @@ def _refuse_beside_resume(context: typer.Context, allowed: Sequence[str]) -> Non
     given = [
         parameter.opts[0]
         for parameter in context.command.params
-        if parameter.name not in ("resume", "track", "no_check", *allowed)
+        if parameter.name not in ("resume", "track", "watch", "no_check", *allowed)
         and options.was_given(context, parameter.name)
     ]
     if given:
@@ -149,19 +154,22 @@ def _refuse_beside_resume(context: typer.Context, allowed: Sequence[str]) -> Non
         )
 
 
-def _train(run: Run, trackers: Sequence[str], check: bool) -> None:
+def _train(run: Run, trackers: Sequence[str], watch: bool, check: bool) -> None:
     with run.trainer(trackers, check) as trainer, stop_requests("stopping after this iteration") as requests:
         if trainer.is_complete and run.is_complete:
             console.note(f"{run.path} is complete at {console.format_count(trainer.step)} steps")
             return
         config = run.config
         _announce(config, run.path, trainer.step)
+        page = _watched(trainer) if watch else None
         with console.TrainingProgress(config.steps, len(config.seeds), trainer.step, config.task) as progress:
 
             def listen(news: Progress) -> bool:
                 for text in news.notes:
                     console.note(text)
                 progress.update(min(news.step, news.total), _shown(news))
+                if page is not None:
+                    page.write(news.step, news.metrics)
                 return not requests
 
             complete = trainer.run(listen)
@@ -174,6 +182,20 @@ def _train(run: Run, trackers: Sequence[str], check: bool) -> None:
         )
         raise typer.Exit(130)
     _report(trainer, run.path, config)
+
+
+def _watched(trainer: Trainer) -> Guarded:
+    """Return what draws the page of a run; where it fails the user is told, and the run goes on."""
+    from esp_cli.training.trackers import Guarded
+
+    def opened() -> Tracker:
+        from esp_cli.reporting.live import LivePage
+
+        page = LivePage(trainer)
+        console.note(f"watch it in a browser: {page.path.resolve().as_uri()}")
+        return page
+
+    return Guarded("--watch", opened, console.note)
 
 
 def _announce(config: RunConfig, path: Path, step: int) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure, FigureBase, SubFigure
+from matplotlib.figure import Figure, SubFigure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Rectangle
 
@@ -164,8 +164,8 @@ def _add_paths(axes: Axes, episode: Episode) -> None:
         axes.plot(*path[0], "o", color=body.color, markeredgecolor="white", markersize=7, zorder=4)
 
 
-def _width(figure: FigureBase) -> float:
-    return float(figure.bbox.width) / figure.dpi
+def _width(figure: Any) -> float:  # what figures and their parts have in common has no types
+    return float(figure.bbox.width / figure.dpi)
 
 
 def _add_legend(figure: SubFigure, scene: Scene, *, started: bool) -> None:
@@ -191,7 +191,12 @@ def _add_body(axes: Axes, body: Body, small: bool = False) -> None:
     (x, y), r = body.position, body.radius
     if body.name and body.shape == "disc":
         on = 2 * r / np.ptp(axes.get_xlim()) * _width(axes.figure) / (_COLUMNS if small else 1) > _LEAST_LETTER
-        place = {"xytext": (0, 0) if on else (6, 6), "textcoords": "offset points", "ha": "center", "va": "center"}
+        place: dict[str, Any] = {
+            "xytext": (0, 0) if on else (6, 6),
+            "textcoords": "offset points",
+            "ha": "center",
+            "va": "center",
+        }
         shift = 0.45 * r if on else 0.0  # crosses lie in the middle
         axes.annotate(
             body.name,

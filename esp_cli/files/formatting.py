@@ -6,8 +6,9 @@ import contextlib
 import errno
 import math
 import os
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
+from html import escape
 from unicodedata import category
 
 from esp_envs.errors import UserError
@@ -96,6 +97,20 @@ def nearest(text: str, known: Iterable[str]) -> str | None:
     short = [name for name in names if text == "".join(word[0] for word in name.split("_") if word)]
     part = [name for name in names if text in name.split("_")]
     return next(iter(short + part), None)
+
+
+class Shown:
+    """Says in `repr`, and in a notebook as a table, what an object is: `_facts` gives a value or text by name."""
+
+    def _facts(self) -> Mapping[str, object]:
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({'; '.join(f'{name}: {fact}' for name, fact in self._facts().items())})"
+
+    def _repr_html_(self) -> str:
+        rows = (f"<tr><th>{escape(n)}</th><td>{escape(str(fact))}</td></tr>" for n, fact in self._facts().items())
+        return f"<table><caption>{type(self).__name__}</caption>{''.join(rows)}</table>"
 
 
 def did_you_mean(text: str, known: Iterable[str]) -> str:

@@ -5,12 +5,13 @@ Whatever does not fit is refused by a `UserError` of one sentence.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 
+from esp_cli.files.formatting import Shown
 from esp_cli.symmetry import Transform
 from esp_envs.errors import UserError
 from esp_envs.spec import ActionSpace, Continuous, Discrete, Layout, Spaces
@@ -190,16 +191,16 @@ def _agents(spaces: Spaces) -> tuple[int, ...]:
     return (spaces.num_agents,) if spaces.num_agents > 1 else ()
 
 
-class Draws(nn.Module):
+class Draws(Shown, nn.Module):
     """Keeps a generator. Its state is all that `state_dict` holds, and a file without it loads too."""
 
-    def __init__(self, shown: str, observation: Layout, action: ActionSpace, seed: int) -> None:
+    def __init__(self, shown: Mapping[str, object], observation: Layout, action: ActionSpace, seed: int) -> None:
         super().__init__()
         acts = f"{action.count} choices" if isinstance(action, Discrete) else action.layout.summary
-        self._shown = f"{shown}\nobservation: {observation.summary}\naction: {acts}"
+        self._shown = {**shown, "observation": observation.summary, "action": acts}
         self.generator = torch.Generator().manual_seed(seed)
 
-    def extra_repr(self) -> str:
+    def _facts(self) -> Mapping[str, object]:
         return self._shown
 
     def get_extra_state(self) -> Tensor:

@@ -84,7 +84,7 @@ class Symmetry(Draws):
         seed: int = 0,
     ) -> None:
         shapes.check_arguments(observation, action, group, num_agents, state, copies, seed)
-        super().__init__(f"group={group!r}, num_agents={num_agents}, copies={copies!r}", observation, action, seed)
+        super().__init__({"group": group, "agents": num_agents, "copies": copies}, observation, action, seed)
         state = state or joint_layout(observation, num_agents)
         spaces = Spaces(num_agents=num_agents, observation=observation, state=state, action=action, symmetry="c1")
         self.spaces = unrestricted(spaces)

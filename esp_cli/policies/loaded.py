@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from esp_cli.algorithms.learner import Learner
 from esp_cli.algorithms.presets import ALGORITHMS
+from esp_cli.files.formatting import Shown, format_count
 from esp_cli.networks.build import NETWORKS
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.policies.loading import TrainedPolicy, open_policy
@@ -31,7 +32,7 @@ Floats = NDArray[np.float32]
 Action = NDArray[np.int64] | NDArray[np.float32]
 
 
-class LoadedPolicy:
+class LoadedPolicy(Shown):
     """One seed's policy, ready to act; agents share it, so every row of observations is an agent of its own.
 
     Example:
@@ -54,6 +55,16 @@ class LoadedPolicy:
         self.source = trained.source
         self.team = trained.policy.actor.team
         self.memory_width = int(trained.policy.initial_memory(1, torch.empty(0)).shape[-1])
+
+    def _facts(self) -> Mapping[str, object]:
+        config, action = self.trained.config, self.spec.action
+        return {
+            "policy": f"{config.algorithm} on {config.task}, prior {config.prior.kind}, network {config.network.name}",
+            "source": self.source,
+            "seed": f"{config.seeds[0]}, after {format_count(self.trained.step)} steps",
+            "observation": self.spec.observation.summary,
+            "action": f"{action.count} choices" if isinstance(action, Discrete) else action.layout.summary,
+        }
 
     def act(
         self, obs: ArrayLike, rng: np.random.Generator | None = None, action_mask: ArrayLike | None = None

@@ -18,7 +18,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, FileSystemLoader
+from jinja2 import Environment, FileSystemLoader, Template
 
 from esp_cli.defaults import __version__
 from esp_cli.drawing.draw import Request, draw
@@ -37,6 +37,7 @@ from esp_cli.training.folder_names import POLICY
 from esp_cli.training.metrics import read_metrics
 from esp_cli.training.run_folder import RunFolder
 from esp_envs.errors import UserError
+from esp_envs.spec import TaskSpec
 
 PAGE, MARKDOWN, RESULTS, FILM = "report.html", "report.md", "results.json", "film.gif"
 CURVES = "curves"
@@ -57,7 +58,7 @@ def write_report(material: Material, out: Path, style: Style = "screen") -> list
     with TemporaryDirectory() as scratch:
         curves, hovers = draw_curves(material, Path(scratch) / CURVES, style=style)
         pictures = [curves, *draw_variants(material.results, Path(scratch), style)]
-        images = [(picture.png.stem, _data_uri(picture.svg.read_bytes(), "image/svg+xml")) for picture in pictures]
+        images = [(picture.png.stem, data_uri(picture.svg.read_bytes(), "image/svg+xml")) for picture in pictures]
         for file in sorted(Path(scratch).iterdir()):
             replace_file(out / file.name, file.read_bytes())
     tables, study = all_tables(material.results), material.study
@@ -71,7 +72,7 @@ def write_report(material: Material, out: Path, style: Style = "screen") -> list
         for cell in whole.values()
     ]
     titles = {material.runs[cell.name]: f"{cell.panel}: {cell.variant}" for cell in study.cells}
-    films = [(title, _data_uri(film, "image/gif")) for run, title in titles.items() if (film := _film(run / FILM))]
+    films = [(title, data_uri(film, "image/gif")) for run, title in titles.items() if (film := _film(run / FILM))]
     content = {
         "title": study.title,
         "version": __version__,
@@ -85,14 +86,13 @@ def write_report(material: Material, out: Path, style: Style = "screen") -> list
         "films": films,
         "runs": runs,
     }
-    templates = Environment(loader=FileSystemLoader(_TEMPLATES), autoescape=True, trim_blocks=True, lstrip_blocks=True)
     names = [picture.png.stem for picture in pictures]
     markdown = [f"# {markdown_text(study.title)}", _fenced(study.command)]
     markdown += [f"## {markdown_text(table.title)}\n\n{table.markdown()}" for table in tables]
     markdown += [f"![{name}]({name}.png)" for name in names]
     markdown += ["## Each run by itself", _fenced("\n".join(run["command"] for run in runs))]
     files = {
-        PAGE: escaped(templates.get_template("report.html").render(content)).encode(),
+        PAGE: escaped(template("report.html").render(content)).encode(),
         MARKDOWN: (escaped("\n\n".join(markdown)) + "\n").encode(),
         RESULTS: encode(material.results.document(), out / RESULTS),
     }
@@ -106,12 +106,23 @@ def draw_films(runs: Mapping[str, Path], watch: Callable[[int], None]) -> None:
     for count, run in enumerate(runs.values(), start=1):
         if (run / POLICY).is_file() and not _film(run / FILM):
             trained = TrainedPolicy.read(run / POLICY)
-            speed = max(1.0, trained.spec.horizon * trained.spec.control_period_s / _FILM_SECONDS)
+            speed = film_speed(trained.spec)
             with TemporaryDirectory() as scratch:
                 film = Path(scratch) / FILM
                 draw(Request(film, view="top", size=_FILM_PIXELS, speed=speed, fps=_FILM_FRAMES_PER_SECOND), [trained])
                 replace_file(run / FILM, film.read_bytes())
         watch(count)
+
+
+def film_speed(spec: TaskSpec) -> float:
+    """Return the speed, times real time, at which an episode of a task takes no longer than a page's film may."""
+    return max(1.0, spec.horizon * spec.control_period_s / _FILM_SECONDS)
+
+
+def template(name: str) -> Template:
+    """Return a page's template, which escapes what it is given."""
+    folder = FileSystemLoader(_TEMPLATES)
+    return Environment(loader=folder, autoescape=True, trim_blocks=True, lstrip_blocks=True).get_template(name)
 
 
 def write_csv(path: Path, material: Material) -> int:
@@ -144,7 +155,8 @@ def _film(path: Path) -> bytes:
     return content if content and content.startswith(b"GIF8") else b""
 
 
-def _data_uri(content: bytes, kind: str) -> str:
+def data_uri(content: bytes, kind: str) -> str:
+    """Return content of a MIME type as an address that a page needs no file for."""
     return f"data:{kind};base64,{base64.b64encode(content).decode()}"
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from esp_cli.files.formatting import attempting
+from esp_cli.files.formatting import Shown, attempting
 from esp_cli.files.opening import open_own, open_regular, require_held
 from esp_cli.files.writing import MAX_LINE_BYTES, TAIL_BYTES, replacing, write_all
 from esp_cli.training.trackers import Guarded
@@ -131,7 +131,7 @@ def column(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[NDArray[np.int
     return np.array([step for step, _ in found], dtype=np.int64), values
 
 
-class Metrics(Mapping[str, Floats]):
+class Metrics(Shown, Mapping[str, Floats]):
     """Metrics by name: one row per update, one column per seed, [U, S]; [U, 1] of what the run has as a whole.
 
     Example:
@@ -162,6 +162,15 @@ class Metrics(Mapping[str, Floats]):
                     self._arrays[name] = np.full((len(rows), columns), math.nan)
                     self._whole |= set() if isinstance(value, list) else {name}
                 self._arrays[name][index] = np.array(value, dtype=np.float64)
+
+    def _facts(self) -> Mapping[str, object]:
+        """Return what there is, and the newest mean over seeds of what was evaluated."""
+        last = {name: array[np.isfinite(array).all(1)][-1:] for name, array in self._arrays.items() if "eval/" in name}
+        newest = {name: f"{rows.mean():.4g}" for name, rows in last.items() if rows.size}
+        what = (
+            f"{len(self.steps)} of {len(self)} names, steps {self.steps.min(initial=0)} to {self.steps.max(initial=0)}"
+        )
+        return {"rows": what, "seeds": ", ".join(map(str, self.seeds)), **newest}
 
     def __getitem__(self, name: str) -> Floats:
         return self._arrays[name]

@@ -17,6 +17,7 @@ from esp_cli import console
 from esp_cli.algorithms.learner import Iteration
 from esp_cli.algorithms.mappo import Mappo
 from esp_cli.checking import SymmetryReport, measured
+from esp_cli.reporting.live import LIVE
 from esp_cli.training.checkpoint import load_checkpoint
 from esp_cli.training.metrics import read_metrics
 from esp_cli.training.run_folder import RunFolder
@@ -363,3 +364,30 @@ def test_a_run_that_ends_within_its_warm_up_says_so(tmp_path: Path) -> None:
     assert warm in esp(*words, 100, "--out", tmp_path / "short").stderr
     longer = ("--set", "qmix.warmup_episodes=1", "--set", "qmix.batch_episodes=1", "--set", "network.hidden=[8]")
     assert warm not in esp(*words, 100, *longer, "--out", tmp_path / "longer").stderr
+
+
+def test_a_page_to_watch_shows_curve_and_policy_and_changes_nothing(tmp_path: Path) -> None:
+    plain = train_tiny(tmp_path / "plain")
+    told = esp("train", "--resume", plain, "--watch")
+    assert "complete" in told.stderr
+    watched = train_tiny(tmp_path / "watched", "--watch")
+    page = (watched / LIVE).read_text()
+    assert page.count("data:image/svg+xml;base64,") == page.count("data:image/gif;base64,") == 1
+    assert "The run is complete" in page
+    assert 'http-equiv="refresh"' not in page
+    assert not (plain / LIVE).exists(), "off by default"
+    same = [(run / "policy.safetensors").read_bytes() for run in (plain, watched)]
+    assert same[0] == same[1]
+
+
+def test_a_page_that_cannot_be_drawn_is_told_once_and_stops_no_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise MemoryError("no room for pixels")
+
+    monkeypatch.setattr("esp_cli.reporting.live.draw", fails)
+    monkeypatch.setattr("esp_cli.reporting.live.draw", fails)
+    said = esp("train", "--steps", 100, *TINY_OPTIONS, "--out", tmp_path / "run", "--watch").stderr
+    assert said.count("tracking with --watch ended: it cannot write (no room for pixels); the run goes on") == 1
+    assert (tmp_path / "run" / "policy.safetensors").is_file()

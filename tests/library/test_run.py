@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from esp_cli import Progress, Run, load_policy, train
+from esp_cli import Field, Kind, Progress, Run, Symmetry, discrete_moves, layout, load_policy, train
 from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.run import begin
 from esp_cli.training.config import resolve_config
@@ -195,3 +195,19 @@ def test_runs_of_one_second_get_folders_of_their_own(tmp_path: Path, monkeypatch
     names = [train(steps=8, seeds=(seed,), settings=tiny).path.name for seed in (0, 1, 2)]
     first = "navigation-mappo-esp-20261125-090121"
     assert names == [first, f"{first}-2", f"{first}-3"]
+
+
+def test_runs_metrics_policies_and_symmetries_say_what_they_are(run: Run) -> None:
+    symmetry = Symmetry(observation=layout(Field("a<b", Kind.VECTOR)), action=discrete_moves(4), group="d4")
+    for thing, *words in (
+        (run, str(run.path), "mappo on navigation", "400 of 400", "eval/return_greedy"),
+        (run.metrics, "rows: 5 of", "steps 0 to 400", "eval/return_greedy"),
+        (run.policy, "mappo on navigation", "seed: 3", "choices"),
+        (symmetry, "group: d4", "copies: draw"),
+    ):
+        shown, table = repr(thing), thing._repr_html_()
+        assert "\n" not in shown
+        assert all(word in shown for word in words), shown
+        assert table.startswith(f"<table><caption>{type(thing).__name__}</caption><tr><th>")
+        assert "a<b" not in table
+        assert [row.count("<td>") for row in table.split("<tr>")[1:]] == [1] * (table.count("<tr>"))

@@ -82,8 +82,8 @@ def test_it_is_a_module_that_holds_its_draws_alone() -> None:
     with pytest.raises(RuntimeError, match=r"Missing key\(s\) in state_dict: \"actor.bias\""):
         older.load_state_dict({"actor.weight": before["actor.weight"]})
     assert one.to(torch.float64).symmetry.augment(random(2, 3), torch.zeros(2, dtype=torch.int64)).obs.shape == (4, 3)
-    shown = "group='d4', num_agents=1, copies='draw'\n  observation: velocity 2, load 1\n  action: 4 choices"
-    assert repr(one.symmetry) == f"Symmetry(\n  {shown}\n)"
+    shown = "group: d4; agents: 1; copies: draw; observation: velocity 2, load 1; action: 4 choices"
+    assert repr(one.symmetry) == f"Symmetry({shown})"
     assert "action: force 2" in repr(Symmetry(observation=SEEN, action=FORCE))
 
 
