@@ -161,6 +161,7 @@ class _Pairs:
             alike = there(0, _HERE[0])
             verdicts = [
                 _verdict(name, first[name], second[name], alike[name], near[name])
+                or _beside_what_is_seen(name, (first, second, *apart()), near)
                 or _by_distances(name, first[name], second[name], *(side[name] for side in apart()))
                 for name in first
             ]
@@ -192,6 +193,23 @@ def _verdict(name: str, x: Tensor, x2: Tensor, y: Tensor, near: Tensor) -> Field
     found = _state_by_state(name, (x - y).abs().amax(1), _ROUNDINGS * rounding, scale)
     is_certain = float((x - x2).abs().max()) <= NEGLIGIBLE * scale
     return found if is_certain or found.outcome == "holds" else None
+
+
+def _beside_what_is_seen(name: str, sides: Sequence[Outcomes], near: Outcomes) -> FieldVerdict | None:
+    """Find a field with chance broken by how often runs agree in it and in all that is seen before the step.
+
+    Episodes may draw a goal that no state holds and that agents see. Then rewards may be alike by themselves, and yet
+    not beside the goal. Distances of continuous chance never agree, and of these this says nothing.
+    """
+    names = dict.fromkeys([*(one for one in near if one.startswith("start obs.")), name])
+    rows, _ = _known(*(torch.cat([side[one] for one in names], 1) for side in (*sides, near)))
+    tolerance = NEGLIGIBLE * rows[0].std(0).clamp_min(1e-6)
+    is_clear = (_ROUNDINGS * (rows[0] - rows[-1]).abs() <= tolerance).all(1)
+    x, x2, y, y2 = (side[is_clear] for side in rows[:4])
+    within, across = ((x - x2, y - y2), (x - y, x2 - y2, x - y2, x2 - y))
+    samples = _excess(lambda gap: (gap.abs() > tolerance).any(1, keepdim=True).double(), within, across)
+    share, error = float(samples.mean()), float(samples.std()) / max(1, len(samples)) ** 0.5
+    return FieldVerdict(name, "broken", share, error, share=share) if share > max(SIGNIFICANT * error, _FEW) else None
 
 
 def _by_distances(name: str, x: Tensor, x2: Tensor, y: Tensor, y2: Tensor) -> FieldVerdict:

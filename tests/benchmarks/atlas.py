@@ -52,7 +52,7 @@ NOT_CARRIED = {
 """Why tasks are left out."""
 TRIED = {"collect_treasure": "d4,agents"}
 """What is tried, where it is not what a check tries by default."""
-SECONDS = 300.0
+SECONDS = 1200.0
 """Time for a check; what does not fit in is not covered."""
 
 

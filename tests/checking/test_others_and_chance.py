@@ -108,6 +108,45 @@ class Louder(Noisy):
         return drawn * (1 + 2 * (x > 0))
 
 
+class Goal(Noisy):
+    """Each episode draws which of two places pays, and shows its number; the places may change round."""
+
+    def _describe(self):
+        places = Field("places", Kind.SCALAR, 2)
+        return TaskSpec(
+            name="goal", version=1, convention="", num_agents=1, horizon=8, symmetry="c1", shared_reward=True,
+            observation=layout(places, Field("goal", Kind.SCALAR)), action=STEPS, state=layout(places),
+        )  # fmt: skip
+
+    def _start(self, generator):
+        self.goal = torch.randint(2, (1, self.num_envs, 1), generator=generator)
+        return {"places": self.draw(2, 1, generator=generator)}
+
+    def _advance(self, world, action):
+        return self.paid(world["places"].squeeze(-1)), {}
+
+    def paid(self, places):
+        return places.gather(-1, self.goal)
+
+    def _observe(self, world):
+        return torch.cat([world["places"].squeeze(-1), self.goal.float()], -1).unsqueeze(2)
+
+
+class AnyGoal(Goal):
+    """The number says nothing of what pays."""
+
+    def paid(self, places):
+        return places.sum(-1, keepdim=True) * (1 + self.goal)
+
+
+@pytest.mark.parametrize(("cls", "outcome"), [(Goal, "broken"), (AnyGoal, "holds")])
+def test_a_reward_is_judged_beside_the_goal_that_an_episode_draws_and_shows(cls, outcome: str) -> None:
+    register(cls)
+    make_it = lambda num_envs, seeds: cls(cls.Settings(), num_envs, generators_for(seeds))  # noqa: E731
+    (found,) = check_symmetry(make_it, "places-1-0").elements
+    assert (found.outcome, found.worst.field) == (outcome, "reward" if cls is Goal else found.worst.field)
+
+
 @pytest.mark.parametrize(("cls", "outcome"), [(Noisy, "holds"), (Odd, "holds"), (Louder, "broken")])
 def test_the_same_chance_proves_what_holds_and_refuses_nothing(cls, outcome: str) -> None:
     register(cls)
