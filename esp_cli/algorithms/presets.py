@@ -84,6 +84,12 @@ TUNED: dict[str, dict[str, Sections]] = {
             "network": {"name": "mpn", "activation": "relu"},
             "prior": _TURNS,
         },
+        # A robot that shakes falls, so noise has to shrink before it can walk, but not at once.
+        "quadruped": {
+            "mappo": {"num_envs": 256, "num_steps": 24, "num_epochs": 5, "entropy_coef": 0.003},
+            "network": {"activation": "relu"},
+            "evaluation": {"every_steps": 50_000},
+        },
     },
     "maddpg": {
         # The robots are slow and their actions bounded. Without strong noise, and a penalty that keeps the outputs off
