@@ -154,7 +154,6 @@ app = typer.Typer(
     context_settings=_HELP_NAMES,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
-    epilog="Start with: esp demo (half a minute), or esp train --preset fast --steps 100k (half a minute)",
 )
 
 
@@ -169,7 +168,10 @@ _VERSION = typer.Option("--version", help="Print the version and leave.", callba
 
 @app.callback()
 def root(version: Annotated[bool, _VERSION] = False) -> None:
-    """Train, evaluate and render multi-agent policies with the symmetry prior of ESP."""
+    """Train, evaluate and render multi-agent policies with the symmetry prior of ESP.
+
+    Start with: esp demo, or esp train --preset fast --steps 100k; each takes half a minute.
+    """
 
 
 def main() -> None:

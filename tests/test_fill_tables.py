@@ -256,7 +256,7 @@ def test_the_papers_whole_table_marks_what_was_not_run(tmp_path):
 
 def test_evaluations_and_curves_are_tables_too(tmp_path):
     score = {"mean": -120.0, "sem": 1.5}
-    run = {"greedy": score, "stochastic": None, "heuristics": ["greedy", "cover"], "metrics": {"arrival_rate": 0.5}}
+    run = {"greedy": score, "stochastic": None, "heuristics": ["nearest", "cover"], "metrics": {"arrival_rate": 0.5}}
     run |= {
         "anchors": {"random": -220.0, "heuristic": -112.6, "cover": -109.1},
         "metrics_per_seed": {"arrival_rate": [0.25, 0.75]},

@@ -126,6 +126,9 @@ def restore_generators(generators: Sequence[torch.Generator], states: Tensor) ->
         generator.set_state(state.cpu().clone())
 
 
+_ONCE_GREEDY = ("nearest", "chase")  # heuristics that scripts and files of 0.1 call so
+
+
 def put_back(env: Environment, observation: Observation) -> None:
     """Put worlds back to the last observation of their episodes, for a picture; draws no random numbers."""
     states = generator_states(env.generators)
@@ -158,7 +161,7 @@ class Environment(ABC):
             raise UserError("an environment needs at least one world and one seed")
         if not isinstance(self.heuristics, tuple) or not all(isinstance(name, str) for name in self.heuristics):
             raise UserError(
-                f"{type(self).__name__}.heuristics is {self.heuristics!r}; give a tuple of names, as ('greedy',)"
+                f"{type(self).__name__}.heuristics is {self.heuristics!r}; give a tuple of names, as ('nearest',)"
             )
         self.settings = settings
         self.num_envs = num_envs
@@ -227,6 +230,8 @@ class Environment(ABC):
     def named_heuristic(self, name: str | None) -> str:
         """Return a heuristic's name with its default filled in; a UserError refuses unknown ones."""
         name = name or self.heuristics[0]
+        if name == "greedy" and self.heuristics[0] in _ONCE_GREEDY:  # which now names a mode of learned policies alone
+            name = self.heuristics[0]
         if name not in self.heuristics:
             raise UserError(f"{self.spec.name} has no heuristic '{name}'; it has {', '.join(self.heuristics)}")
         return name

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+import typer
 
 from esp_cli import console
 from esp_cli.commands import options
@@ -11,7 +13,9 @@ from esp_cli.defaults import EPISODES
 
 if TYPE_CHECKING:
     from esp_cli.policies.evaluation import FinalEvaluation
+    from esp_cli.policies.loading import TrainedPolicy
 
+_AGENT_STEPS = 100_000  # of each policy, beyond which fewer episodes are played
 EPILOG = """Examples:\n
     esp eval navigation --algo mappo --prior none\n
     esp eval runs/cn-mappo\n
@@ -22,7 +26,17 @@ EPILOG = """Examples:\n
 def evaluate(
     policy: options.PolicyArgument,
     task: options.OwnTaskOption = None,
-    episodes: options.EpisodesOption = EPISODES,
+    episodes: Annotated[
+        int | None,
+        typer.Option(
+            "--episodes",
+            "-e",
+            min=1,
+            max=1_000_000,
+            help="Episodes per seed and policy; fewer unless given where they are long or of many agents.",
+            show_default=str(EPISODES),
+        ),
+    ] = None,
     physics: options.PhysicsOption = None,
     settings: options.TaskSetOption = None,
     algo: options.BundledAlgoOption = None,
@@ -41,9 +55,16 @@ def evaluate(
     trained = open_policy(policy, algo, prior).transfer(options.parse_task_settings(settings or [], physics))
     for text in trained.notes:
         console.note(text)
-    result = evaluate_policy(trained, episodes)
+    result = evaluate_policy(trained, episodes or _default(trained))
+    if not episodes and result.episodes < EPISODES:
+        console.note(f"episodes are long: {result.episodes} each, not {EPISODES}; --episodes {EPISODES} for less error")
     source = trained.source
     console.result(json, result, lambda: _print(result, source.stem if source.is_file() else str(source)))
+
+
+def _default(trained: TrainedPolicy) -> int:
+    """Return how many episodes are played unless the user says so: a bundled policy of robots is done in 20 s."""
+    return max(1, min(EPISODES, _AGENT_STEPS // (trained.spec.horizon * trained.spec.num_agents)))
 
 
 def _print(result: FinalEvaluation, policy: str) -> None:

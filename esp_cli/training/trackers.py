@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from esp_cli.files.documents import flat
 from esp_cli.files.opening import own_folder
@@ -146,7 +146,14 @@ class MlFlow:
         self._client.set_terminated(self._run_id)
 
 
-Tracker = TensorBoard | WeightsAndBiases | MlFlow
+class Tracker(Protocol):
+    """What gets the rows of a run."""
+
+    def write(self, step: int, values: Row) -> None: ...
+
+    def close(self) -> None: ...
+
+
 TRACKERS: dict[str, Callable[[TrackedRun], Tracker]] = {
     "tensorboard": TensorBoard,
     "wandb": WeightsAndBiases,

@@ -72,7 +72,7 @@ def test_one_seed_that_stopped_has_no_return(monkeypatch: pytest.MonkeyPatch) ->
         ["greedy", "-", "-", "-"],
         ["stochastic", "-", "-", "-"],
     ]
-    assert "heuristic greedy" in told.stdout
+    assert "heuristic nearest" in told.stdout
     assert "metric" not in told.stdout
 
 
@@ -162,3 +162,15 @@ def test_a_policy_is_judged_under_other_settings_of_its_task(finished: Path) -> 
 )
 def test_settings_that_a_policy_cannot_take_are_refused(finished: Path, setting: str, sentence: str) -> None:
     assert sentence in refused("eval", finished, "--episodes", 2, "--set", setting)
+
+
+def test_fewer_episodes_are_played_where_they_are_long_or_of_many_agents_and_the_output_says_so(
+    monkeypatch: pytest.MonkeyPatch, finished: Path
+) -> None:
+    monkeypatch.setattr("esp_cli.commands.eval._AGENT_STEPS", 5 * 25 * 3 + 1)  # of navigation: 25 steps, 3 agents
+    told = esp("eval", finished)
+    assert "5 episodes" in told.stdout
+    assert "5 each, not 320; --episodes 320 for less error" in told.stderr
+    asked = esp("eval", finished, "--episodes", 6)
+    assert "6 episodes" in asked.stdout
+    assert "each, not" not in asked.stderr

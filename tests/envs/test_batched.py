@@ -203,7 +203,7 @@ def test_tensors_of_another_shape_are_refused(method: str, value, sentence: str)
 
 @pytest.mark.parametrize("given", ["go", ["go"], (1,)])
 def test_heuristics_are_a_tuple_of_names(given) -> None:
-    told = re.escape(f"Odd.heuristics is {given!r}; give a tuple of names, as ('greedy',)")
+    told = re.escape(f"Odd.heuristics is {given!r}; give a tuple of names, as ('nearest',)")
     with pytest.raises(ValueError, match=told):
         worlds(type("Odd", (Plain,), {"heuristics": given}))
 

@@ -149,10 +149,10 @@ def test_cover_stands_between_two_landmarks() -> None:
 
 
 def test_cover_is_left_out_where_it_cannot_enumerate() -> None:
-    assert make("navigation", 1, [0], {"num_agents": 4, "num_landmarks": 6}).heuristics == ("greedy", "cover")
+    assert make("navigation", 1, [0], {"num_agents": 4, "num_landmarks": 6}).heuristics == ("nearest", "cover")
     env = make("navigation", 1, [0], {"num_agents": 4, "num_landmarks": 7})
     env.reset()
-    with pytest.raises(ValueError, match="has no heuristic 'cover'; it has greedy"):
+    with pytest.raises(ValueError, match="has no heuristic 'cover'; it has nearest"):
         env.heuristic("cover")
 
 
@@ -166,3 +166,12 @@ def test_half_of_the_worlds_follows_the_heuristic() -> None:
     assert torch.equal(mixed[:, 2:], drawn[:, 2:])
     assert torch.equal(drawn, before)
     assert not torch.equal(mixed, drawn), "the control"
+
+
+def test_the_former_name_of_a_heuristic_still_names_it() -> None:
+    for task, name in (("navigation", "nearest"), ("predator-prey", "chase")):
+        env = make(task, 1, [0])
+        env.reset()
+        assert torch.equal(env.heuristic("greedy"), env.heuristic(name))
+    with pytest.raises(ValueError, match="has no heuristic 'greedy'; it has avoid"):
+        make("formation", 1, [0]).heuristic("greedy")

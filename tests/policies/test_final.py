@@ -42,7 +42,7 @@ def test_a_final_evaluation_states_what_was_played_and_is_json(tmp_path):
     assert (result.source, result.step, result.seeds, result.episodes) == (str(tmp_path), 0, (3, 7), 3)
     assert result.greedy.per_seed != result.stochastic.per_seed
     assert json.loads(result.model_dump_json())["anchors"].keys() == {"random", "heuristic", "cover"}
-    assert result.heuristics == ("greedy", "cover")
+    assert result.heuristics == ("nearest", "cover")
     assert result.anchor_metrics.keys() == result.anchors.keys()
     assert all(metrics.keys() == result.metrics.keys() for metrics in result.anchor_metrics.values())
     for name, values in result.metrics_per_seed.items():
@@ -92,7 +92,7 @@ def test_a_checkpoint_and_a_policy_file_say_who_stopped(meta, stopped):
 
 def test_anchors_lie_where_the_card_says(tmp_path):
     anchors = evaluate(untrained(tmp_path), 256).anchors
-    # the card of navigation: random -218, greedy -112; a mean over 512 episodes has an error of about 2
+    # the card of navigation: random -218, nearest -112; a mean over 512 episodes has an error of about 2
     assert anchors["random"] == pytest.approx(-218, abs=8)
     assert anchors["heuristic"] == pytest.approx(-112, abs=5)
 

@@ -128,10 +128,10 @@ class Navigation(ParticleTask):
     the mirror `flip-x`, `gust_mean` the mirror `flip-diagonal`, `weak_agent` all but the exchange of agents,
     `action_turn_rad` the rotations, `reward_offset` (d is measured to places right of the landmarks) `flip-x`.
 
-    Heuristics: `greedy` (each agent takes a landmark of its own, above 8 agents by the Hungarian method), `cover`
+    Heuristics: `nearest` (each agent takes a landmark of its own, above 8 agents by the Hungarian method), `cover`
     (agents share out all landmarks between them, for L > N; where there are at most 4096 ways, N^L, to do so).
 
-    Anchors, `esp` convention, N = L = 3, return of one agent per episode: random -218, greedy -112,
+    Anchors, `esp` convention, N = L = 3, return of one agent per episode: random -218, nearest -112,
     cover -109.
 
     Versions:
@@ -139,14 +139,14 @@ class Navigation(ParticleTask):
     """
 
     Settings: ClassVar[type[NavigationSettings]] = NavigationSettings
-    heuristics: tuple[str, ...] = ("greedy", "cover")
+    heuristics: tuple[str, ...] = ("nearest", "cover")
     settings: NavigationSettings
 
     def __init__(self, settings: NavigationSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
         super().__init__(settings, num_envs, generators)
         agents, landmarks = settings.num_agents, settings.landmarks
         if landmarks * math.log(agents) > math.log(covering.MAX_SHARINGS):
-            self.heuristics = ("greedy",)
+            self.heuristics = ("nearest",)
         if self.settings.many:
             return
         self._to_landmarks = self.worlds.squared_watched_distance.view(agents, landmarks, -1)
@@ -220,11 +220,11 @@ class Navigation(ParticleTask):
         return ways - self.world["position"].unsqueeze(3)
 
     def heuristic(self, name: str | None = None) -> Tensor:
-        """Return the joint action of `greedy` (default) or `cover`."""
+        """Return the joint action of `nearest` (default) or `cover`."""
         worlds, agents = self.worlds, self.settings.num_agents
         position, landmark = worlds.position, worlds.entity[agents:] + self._shift
         one_each = covering.assigned if self.settings.many else covering.one_each
-        assign = one_each if self.named_heuristic(name) == "greedy" else covering.shared_out
+        assign = one_each if self.named_heuristic(name) == "nearest" else covering.shared_out
         goal = assign(position, landmark)
         return self._to_action(covering.approach(goal, position, worlds.velocity))
 

@@ -86,9 +86,9 @@ class PredatorPrey(ParticleTask):
     exchange of predators, `action_turn_rad` the rotations, `reward_offset` (who touches a place right of the prey is
     rewarded) the mirror `flip-x`.
 
-    Heuristics: `greedy` (predators run at the prey; with `control="prey"`: the fleeing prey).
+    Heuristics: `chase` (predators run at the prey; with `control="prey"`: the fleeing prey).
 
-    Anchors, `esp` convention, return of one predator per episode against the random prey: random 3.1, greedy 88
+    Anchors, `esp` convention, return of one predator per episode against the random prey: random 3.1, chase 88
     (against the fleeing prey 63, against a still one 167).
 
     Versions:
@@ -96,7 +96,7 @@ class PredatorPrey(ParticleTask):
     """
 
     Settings: ClassVar[type[PredatorPreySettings]] = PredatorPreySettings
-    heuristics = ("greedy",)
+    heuristics = ("chase",)
     settings: PredatorPreySettings
 
     def __init__(self, settings: PredatorPreySettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
@@ -157,7 +157,7 @@ class PredatorPrey(ParticleTask):
         return (world["obstacles"].unsqueeze(-3) - place.unsqueeze(-2)).flatten(-2)
 
     def heuristic(self, name: str | None = None) -> Tensor:
-        """Return the joint action of `greedy`: the chase of predators that learn, the flight of such a prey."""
+        """Return the joint action of `chase`: that of predators that learn, the flight of such a prey."""
         self.named_heuristic(name)
         sides = {"predators": self._chase, "prey": self._flight}
         learning = [wish() for side, wish in sides.items() if self.settings.control in (side, "both")]

@@ -22,7 +22,7 @@ class PredatorPreySettings(ParticleSettings):
     num_obstacles: int = Setting(2, ge=0, le=8, description="fixed discs; 2 in MPE, 3 by the authors' launcher")
     control: Literal["predators", "prey", "both"] = Setting(
         "predators",
-        description="who learns; with 'prey' the predators follow the greedy heuristic, with 'both' each side learns",
+        description="who learns; with 'prey' the predators follow the heuristic `chase`, with 'both' each side learns",
     )
     prey: Literal["random", "fleeing", "still", "policy"] = Setting(
         "random", description="who drives the prey while the predators learn"
