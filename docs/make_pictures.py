@@ -18,12 +18,13 @@ from esp_cli.checking.measured import prepared
 from esp_cli.symmetry import Element, parse_elements
 from esp_cli.symmetry.plane import PlaneElement
 from esp_cli.training.config import resolve_config
+from esp_envs.scene import COLORS
 
 PICTURES = Path(__file__).parent / "pictures"
 AGENTS = np.array([[-0.65, -0.35], [0.1, -0.75], [0.35, 0.5]])
 LANDMARKS = np.array([[-0.3, 0.45], [0.75, -0.45], [0.75, 0.8]])
 MOVES = np.array([[0.0, 1.0], [1.0, 0.0], [0.0, 1.0]])
-COLOURS = ("#0072B2", "#D55E00", "#009E73")
+NAMES = {"action_turn_rad": "actions turned (rad)", "reward_offset": "reward moved (length)", "mud": "mud (share)"}
 
 STRENGTHS = {
     "action_turn_rad": (0.0, 0.25, 0.5, 1.0, 1.57),
@@ -32,7 +33,7 @@ STRENGTHS = {
     "wind": (0.0, 0.15, 0.3, 0.6, 1.0),
 }
 """Settings of navigation that break its symmetry."""
-ELEMENTS = {"rot90": "o-", "rot180": "s-", "flip-x": "^--", "flip-y": "v--", "flip-diagonal": "d--"}
+ELEMENTS = {"rot90": "o-", "rot180": "s--", "flip-x": "^-.", "flip-y": "v:", "flip-diagonal": "d-"}
 """What stands for the elements of d4, and how it is drawn."""
 
 Box = tuple[float, float, str]
@@ -42,10 +43,10 @@ UPDATE: tuple[dict[str, Box], tuple[Arrow, ...]] = (
     {
         "worlds": (0, 1, "environment\nsteps"),
         "batch": (1.2, 1, "batch\n(s, a)"),
-        "copies": (2.4, 0, "copies\n(L_g s, K_g a)"),
+        "copies": (2.4, 0, "copies\n$(L_g s, K_g a)$"),
         "networks": (3.6, 1, "policy\nand value"),
         "own": (4.8, 1.7, "the algorithm's\nown loss"),
-        "penalty": (4.8, 0.3, "consistency loss\nc (S_pi + S_V)"),
+        "penalty": (4.8, 0.3, "consistency loss\n$c\\,(S_\\pi + S_V)$"),
         "step": (6.0, 1, "gradient\nstep"),
     },
     (
@@ -116,7 +117,7 @@ def scene(ax: Axes, element: Element, title: str) -> None:
     """Draw agents, landmarks and moves, turned by an element."""
     agents, landmarks, moves = (points @ PlaneElement.of(element).matrix.T for points in (AGENTS, LANDMARKS, MOVES))
     ax.plot(*landmarks.T, "x", color="#444444", markersize=9, markeredgewidth=2)
-    for place, move, colour in zip(agents, moves, COLOURS, strict=True):
+    for place, move, colour in zip(agents, moves, COLORS, strict=False):
         ax.add_patch(Circle(tuple(place), 0.15, color=colour))
         ax.annotate("", place + 0.55 * move, place, arrowprops={"arrowstyle": "-|>", "color": colour, "linewidth": 2})
     ax.set(xlim=(-1.25, 1.25), ylim=(-1.25, 1.25), xticks=[], yticks=[], aspect="equal")
@@ -158,9 +159,12 @@ def trust() -> Figure:
             prepared(resolve_config("navigation", overrides={"prior.trust": "measured", f"task.{setting}": size}))
             for size in strengths
         ]
-        for name, style in ELEMENTS.items():
-            ax.plot(strengths, [run.prior.weights[name] for run in weights], style, label=name, markersize=4)
-        ax.set(title=setting, xlabel="size", ylim=(-0.05, 1.05))
+        for k, (name, style) in enumerate(ELEMENTS.items()):
+            shown = np.array([run.prior.weights[name] for run in weights]) + 0.012 * (
+                2 - k
+            )  # apart where they are equal
+            ax.plot(strengths, shown, style, label=name, markersize=4, color=COLORS[k])
+        ax.set(xlabel=NAMES.get(setting, setting), ylim=(-0.05, 1.05))
         ax.grid(alpha=0.4)
         ax.spines[["top", "right"]].set_visible(False)
     axes[0].set_ylabel("weight of its copies")
@@ -175,7 +179,7 @@ def main() -> None:
     named = {element.name: element for element in elements}
     still, turn = Element(), named["rot90"]
     figures = {
-        "turned-scene": scenes([still, turn], ["state s, joint action a", "rot90: L_g s, K_g a"], 1),
+        "turned-scene": scenes([still, turn], ["state $s$, joint action $a$", "rot90: $L_g s$, $K_g a$"], 1),
         "eight-images": scenes([still, *named.values()], ["identity", *named], 2),
         "esp-update": boxes(*UPDATE, size=(8.0, 2.6)),
         "rooms": boxes(*ROOMS, size=(8.0, 6.5)),
