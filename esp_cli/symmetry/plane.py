@@ -156,7 +156,9 @@ def ring_sources(rays: int, planar: Floats) -> Indices:
     old = np.arctan2(origin[:, 1], origin[:, 0]) * rays / (2 * np.pi)
     whole = np.rint(old)
     if np.abs(whole - old).max() >= _PIXEL_TOLERANCE:
-        raise UserError(f"the rays of a ring of {rays} do not come to lie on rays; it turns by 360 / {rays} degrees")
+        within = [f"d{fold}" for fold in range(3, rays) if rays % fold == 0][:3]
+        fits = ", ".join([f"d{rays}", *within])
+        raise UserError(f"the rays of a ring of {rays} do not come to lie on rays, as they do under {fits}")
     return whole.astype(np.int64) % rays
 
 

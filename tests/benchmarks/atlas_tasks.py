@@ -48,6 +48,38 @@ def first_vectors(task: ParallelTask, agent: str, observation: Any) -> Any:
 
 
 ARM = (Field("arm", V), Field("bend", S), Field("side", P), Field("target", V), Field("spins", P, 2), Field("gap", V))
+TEAMS = {"collector": 6, "deposit": 2}
+
+
+def teams(env: Any) -> list[Any]:
+    """Return the collectors of collect_treasure, then the deposits."""
+    return sorted(env.unwrapped.world.agents, key=lambda agent: not agent.collector)
+
+
+def hoard(self: ParallelTask, env: Any) -> Any:
+    """Return agents, what collectors hold, and treasures; one that was taken is parked far away, and is 0 here."""
+    agents = teams(env)
+    rows = [np.ravel([getattr(a.state, w) for a in t]) for t in (agents[:6], agents[6:]) for w in ("p_pos", "p_vel")]
+    held = [-1 if agent.holding is None else agent.holding for agent in agents[:6]]
+    marks = [(*(mark.state.p_pos * mark.alive), mark.alive, mark.type) for mark in env.unwrapped.world.landmarks]
+    return np.concatenate([*rows, held, np.ravel(marks)])
+
+
+def heap(self: ParallelTask, env: Any, state: Any) -> None:
+    """Put all that there."""
+    agents, start = teams(env), 0
+    for some in (agents[:6], agents[6:]):
+        rows = state[start : start + 4 * len(some)].reshape(2, len(some), 2)
+        start += rows.size
+        for agent, place, speed in zip(some, *rows, strict=True):
+            agent.state.p_pos, agent.state.p_vel = place.astype(float), speed.astype(float)
+    for agent, held in zip(agents[:6], state[start : start + 6], strict=True):
+        agent.holding = None if held < 0 else round(float(held))
+    for mark, (x, y, alive, kind) in zip(env.unwrapped.world.landmarks, state[start + 6 :].reshape(-1, 4), strict=True):
+        mark.alive, mark.type = bool(alive > 0.5), round(float(kind))
+        mark.state.p_pos = np.array([x, y] if mark.alive else [-999.0, -999.0])
+
+
 OWN = (Field("position", V), Field("velocity", V))
 AROUND = (
     Field("others", Kind.RECORD, 7, parts=(Field("at", V), Field("speed", V), Field("is", S, 4))),
@@ -91,6 +123,13 @@ MPE = {
             "deposit": layout(*OWN, *AROUND),
         },
         action={"collector": MOVES, "deposit": MOVES},
+        simulated=layout(
+            *(Field(f"{who}.{what}", V, n, family=who) for who, n in TEAMS.items() for what in ("place", "speed")),
+            Field("held", S, TEAMS["collector"], family="collector"),
+            Field("hoard", Kind.RECORD, 6, parts=(Field("at", V), Field("alive", S), Field("type", S))),
+        ),
+        take=hoard,
+        put=heap,
     ),
 }
 

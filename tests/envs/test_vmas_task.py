@@ -8,6 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from esp_cli.checking import check_symmetry
 from esp_cli.symmetry import build_transform, parse_elements
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
@@ -15,7 +16,7 @@ from esp_envs import Environment, Field, Items, Kind, UserError, generators_for,
 from esp_envs.adapters import seed_of
 from esp_envs.adapters.simulation import groups_of
 from esp_envs.conformance import Subject, check
-from esp_envs.views import OthersAtRandom, RoleView
+from esp_envs.views import OthersAtRandom, RoleView, worlds_of_role
 from tests.own_tasks import save_page_files
 
 vmas = pytest.importorskip("vmas", reason="VMAS comes with the extra 'vmas'")
@@ -92,6 +93,20 @@ def test_every_declared_element_holds(name: str, settings) -> None:
     actions = [env.random_action() for _ in range(4)]
     errors = environment_errors(env, build_transform(elements, env.spec), state, actions)
     assert max(errors.values()) < 2e-3, errors
+
+
+@pytest.mark.parametrize("role", ["agent_blue", "agent_red"])
+def test_a_pitch_has_one_mirror_for_each_team(role: str) -> None:
+    made = worlds_of_role(lambda num_envs, seeds: worlds("Football", {}, num_envs, seeds), role)
+    found = check_symmetry(made, "flip-x,flip-y,agents-1-0-2")
+    assert [one.outcome for one in found.elements] == ["holds", "broken", "holds"]
+
+
+def test_cells_around_an_agent_are_a_ring() -> None:
+    east, west, north, south, south_west, south_east, north_west, north_east = range(8)
+    shown = torch.cat([torch.zeros(16), torch.arange(8.0)])
+    ring = [east, north_east, north, north_west, west, south_west, south, south_east]
+    assert vmas_scenarios._samples_around(None, shown)[16:].tolist() == ring
 
 
 def test_gravity_breaks_a_quarter_turn() -> None:

@@ -36,7 +36,7 @@ def test_a_ring_shows_what_the_rays_would_see_of_the_turned_scene(make_spec, ele
 
 
 def test_a_ray_between_rays_is_refused() -> None:
-    with pytest.raises(ValueError, match="turns by 360 / 12 degrees"):
+    with pytest.raises(ValueError, match="as they do under d12, d3, d4, d6"):
         rows_operator(RING, [rotation(45)], 1)
 
 
