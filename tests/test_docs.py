@@ -167,3 +167,27 @@ def test_a_bad_command_line_does_not(line: str) -> None:
 
 def test_the_citation_names_the_version_of_the_package() -> None:
     assert f"\nversion: {__version__}\n" in (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+
+
+MOST_WORDS, MOST_BY_HAND = 40_000, 25_000
+
+
+def words(text: str) -> int:
+    """Count what a reader reads: neither bars of tables nor signs by themselves."""
+    return sum(any(character.isalnum() for character in part) for part in text.split())
+
+
+def by_hand(text: str) -> str:
+    """Return a page without the tables that are computed and the code, which tests run."""
+    text = re.sub(r"<!-- (?:results|scores): .*?<!-- end of results -->", "", text, flags=re.DOTALL)
+    return re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
+
+
+def test_the_documentation_is_read_in_an_afternoon() -> None:
+    pages = {str(page): page.read_text(encoding="utf-8") for page in (ROOT / "docs").rglob("*.md")}
+    generated = ("api.md", "atlas.md", "robot-models.md", "dependencies.md")
+    assert sum(map(words, pages.values())) <= MOST_WORDS
+    assert sum(words(by_hand(text)) for name, text in pages.items() if Path(name).name not in generated) <= MOST_BY_HAND
+    assert words("| a | --- | -1.5 |") == 2
+    assert by_hand("a <!-- results: f.json pairs -->\nb\n<!-- end of results --> c") == "a  c"
+    assert by_hand("a\n```sh\nesp\n```\nb") == "a\n\nb"

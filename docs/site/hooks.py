@@ -35,7 +35,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     for name, picture in pictures.items():
         files.append(File.generated(config, name, content=picture))
     for path, content in pages.items():
-        shown = InclusionLevel.NOT_IN_NAV if path.startswith("source/") else InclusionLevel.INCLUDED
+        aside = path.startswith("source/") or path == site_reference.DATA
+        shown = InclusionLevel.NOT_IN_NAV if aside else InclusionLevel.INCLUDED
         files.append(File.generated(config, path, content=content, inclusion=shown))
     return files
 
@@ -45,6 +46,8 @@ def on_page_markdown(markdown: str, page: Page, **_: object) -> str:
     if re.search(rf"^\|(?:[^|\n]*(?<!\\)\|){{{_WIDE},}}$", markdown, re.MULTILINE):
         page.meta["hide"] = ["navigation", "toc"]
     folder = posixpath.dirname(page.file.src_uri)
+    if page.file.src_uri == posixpath.join(posixpath.dirname(site_reference.DATA), "index.md"):
+        markdown += f"\n[All of them on one page]({posixpath.basename(site_reference.DATA)})\n"
     return inside(markdown, folder, DOCS / folder) if page.file.abs_src_path else markdown
 
 

@@ -6,19 +6,37 @@ import inspect
 import json
 import re
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import Any
 
 import typer
 
 from esp_cli.app import app
+from esp_cli.reporting.results import RESULTS_FORMAT, read_results, summarised
+from esp_cli.reporting.tables import TABLES
 from esp_cli.symmetry import carried_groups
 from esp_cli.training.settings import Setting, sections
 from esp_envs.registry import make, task_class, task_names
 
+DOCS = Path(__file__).parents[1]
+DATA = "measurements/data.md"  # outside the navigation; the page of results leads to it
+
 
 def pages() -> dict[str, str]:
     """Return path -> Markdown of every generated page."""
-    return {"reference/commands.md": commands(), "reference/settings.md": settings(), "reference/tasks.md": tasks()}
+    reference = {"commands": commands(), "settings": settings(), "tasks": tasks()}
+    return {f"reference/{name}.md": page for name, page in reference.items()} | {DATA: measured()}
+
+
+def measured() -> str:
+    """Return the page of all results files: what made each, and its returns."""
+    text = "# Data\n\nThe results files of `docs/measured`: what made each, how long it trained, and its returns.\n"
+    for file in sorted((DOCS / "measured").glob("*.json")):
+        if RESULTS_FORMAT.is_one(file):
+            results = summarised(read_results(file))
+            tables = (TABLES[name](results) for name in ("provenance", "returns"))
+            text += f"\n## {file.stem}\n\n" + "\n\n".join(table.markdown() for table in tables if table.rows) + "\n"
+    return text
 
 
 def commands() -> str:
