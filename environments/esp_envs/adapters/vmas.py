@@ -1,6 +1,6 @@
 """A VMAS scenario as a task: batched in torch, on CPU or GPU, with a layout that says what its numbers are.
 
-`esp_envs.adapters.vmas_scenarios` holds layouts for four scenarios. Needs the extra `vmas`.
+`esp_envs.adapters.vmas_scenarios` holds layouts of twenty scenarios. Needs the extra `vmas`.
 """
 
 from __future__ import annotations
