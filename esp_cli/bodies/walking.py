@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from functools import cache
 from types import SimpleNamespace
-from typing import ClassVar
 
 import mujoco
 import numpy as np
@@ -58,7 +57,7 @@ class Quadruped(BatchedTask):
 
     Settings = QuadrupedSettings
     settings: QuadrupedSettings
-    heuristics: ClassVar[tuple[str, ...]] = ("trot", "stand")
+    heuristics = ("trot", "stand")
     makes_new_tensors = True
 
     def __init__(self, settings: TaskSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
