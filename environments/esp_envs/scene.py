@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol, TypedDict
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,16 +15,9 @@ DARK, PALE = "#202020", "#d4d4d4"
 """Of what agents look for, and of what is in their way; as far from those above and from each other."""
 
 
-class Look(TypedDict):
-    """What tells an agent from the others, as arguments of a `Body`."""
-
-    color: str
-    name: str
-
-
-def look(index: int) -> Look:
-    """Return the colour and the letter of the agent with this index; the 27th and later have none."""
-    return Look(color=COLORS[index % len(COLORS)], name=chr(ord("A") + index) if index < 26 else "")
+def look(index: int) -> dict[str, Any]:
+    """Return color and name of the agent with this index, as arguments of a `Body`; there are 26 letters."""
+    return {"color": COLORS[index % len(COLORS)], "name": chr(ord("A") + index) if index < 26 else ""}
 
 
 @dataclass(frozen=True)

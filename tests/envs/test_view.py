@@ -282,3 +282,12 @@ def test_the_library_that_the_user_names_is_tried_first(monkeypatch: pytest.Monk
             pass
         assert tried == order
     assert str(refused.value).endswith("(osmesa: osmesa is broken; egl: egl is broken)"), "installing would not help"
+
+
+def test_robots_have_their_letters_above_them(painter: SpacePainter) -> None:
+    plain, lettered = (painter.draw(scene(replace(ROBOT, name=name))).astype(int) for name in ("", "A"))
+    rows, columns = np.nonzero((plain != lettered).any(-1))
+    column, row = painter.camera.project([*ROBOT.position, TOP])
+    assert len(rows) > 20
+    assert np.hypot(columns.mean() - column, rows.mean() - row) < 30
+    assert rows.mean() < row

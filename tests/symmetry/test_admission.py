@@ -131,7 +131,9 @@ def test_a_ring_carries_the_turns_between_its_rays(make_spec) -> None:
     spec = replace(make_spec(action=FORCE), observation=ring, state=ring)
     assert carried_groups(spec) == ("c2", "d2")
     assert transform_set("rot60,flip30", spec).size == 2
-    with pytest.raises(ValueError, match=r"the rays of a ring of 6 do not come to lie on rays, as they do under d6, d3"):
+    with pytest.raises(
+        ValueError, match=r"the rays of a ring of 6 do not come to lie on rays, as they do under d6, d3"
+    ):
         transform_set("rot90", spec)
 
 

@@ -27,6 +27,7 @@ _PILLAR_HEIGHT_M = 0.06
 _GRID_WIDTH_M = 0.004
 _LAYER_M = 0.001  # thickness of what lies flat on the floor
 _TRAIL_LAYER_M = 0.75 * _LAYER_M  # above the lines of the grid, below the goals
+_LETTER_M = 0.06  # height of letters over the floor
 _TRAIL_STEP = 1.0  # shortest straight piece of a trail against the body's radius; finer bends are about a pixel
 _DARK, _NOSE, _OUTSIDE = "#2b2b30", "#fafaf7", "#dededa"
 _AMBIENT, _DIFFUSE, _GLOW = 0.25, 0.35, 0.4
@@ -116,6 +117,7 @@ class SpacePainter:
         mujoco.mj_forward(self._model, self._data)
         self._renderer.update_scene(self._data, self._eye)
         self._add_trails(self._renderer.scene, scene, trail)
+        _add_letters(self._renderer.scene, scene)
         picture: NDArray[np.uint8] = self._renderer.render()
         return picture
 
@@ -153,6 +155,17 @@ class SpacePainter:
                 reach = np.array([length + 2 * half, 2 * half, 0.0])
                 _add_triangle(geoms, start - half * (along + left), along, left, reach, color)
                 _add_triangle(geoms, end + half * (along + left), -along, -left, reach, color)
+
+
+def _add_letters(geoms: mujoco.MjvScene, scene: Scene) -> None:
+    """Write the letter of each robot above it, while there is room for one more shape."""
+    for body in scene.bodies:
+        if body.name and body.heading is not None and geoms.ngeom < geoms.maxgeom:
+            geom, place = geoms.geoms[geoms.ngeom], np.array([*body.position, _LETTER_M])
+            rest = np.ones(3), place, np.eye(3).ravel(), np.ones(4, dtype=np.float32)
+            mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_LABEL, *rest)
+            geom.label = body.name
+            geoms.ngeom += 1
 
 
 def _add_triangle(

@@ -169,8 +169,8 @@ class PredatorPrey(ParticleTask):
         predators = self.settings.num_predators
         bodies = [Body((x, y), OBSTACLE_RADIUS, PALE, label="obstacle") for x, y in places[predators + 1 :]]
         for k, (x, y) in enumerate(places[:predators]):
-            name = look(k)["name"]
-            bodies.append(Body((x, y), PREDATOR_RADIUS, COLORS[0], trail=True, label="predator", name=name))
+            own = look(k) | {"color": COLORS[0]}
+            bodies.append(Body((x, y), PREDATOR_RADIUS, trail=True, label="predator", **own))
         (x, y), touching = places[predators], PREDATOR_RADIUS + PREY_RADIUS
         prey = Body((x, y), PREY_RADIUS, COLORS[1], trail=True, label="prey", reach=touching, held="caught")
         bodies.append(prey)
