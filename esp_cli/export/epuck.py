@@ -1,13 +1,11 @@
-"""What surrounds an exported policy that drives e-pucks: C, a Webots project, a ROS 2 package, and checks of them.
+"""What stands beside an exported policy that drives e-pucks, in Python and C, and checks of it.
 
-Untested in Webots, in ROS 2 and on hardware. What builds an observation from poses is compared with the task in
-thousands of states.
+Untested on hardware. What builds an observation from poses is compared with the task in thousands of states.
 """
 
 from __future__ import annotations
 
 import ctypes
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,23 +14,19 @@ from typing import Any
 import numpy as np
 import torch
 
-from esp_cli.defaults import __version__
 from esp_cli.export.c_file import compiled, numbers
 from esp_cli.export.esp_epuck import FIELDS, PATIENCE_S, Pilot
 from esp_cli.export.layers import Floats, literal
-from esp_cli.export.templates import RUNTIME, filled
+from esp_cli.export.templates import filled
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training.build import build_environment
 from esp_envs.base import Environment
-from esp_envs.epuck.robot import Arena
 from esp_envs.errors import UserError
 
 STATES = 10_000  # states on which the observations built from poses are compared with the task's
 TOLERANCE = 1e-5  # largest difference of an observation's number; float32 in metres gives 1e-6
 Observer = Callable[[Floats, Floats, Floats], Floats]
 """(poses [N, 3], goals [N, 2], pillars [M, 2]) of one state to observations [N, D]."""
-ROS2_PACKAGE = "esp_formation"
-_WEBOTS_RELEASE = "R2023b"
 _WORLDS = 100
 _JITTER_M = 0.001  # noise on the task's positions: in a perfect square two robots are equally near
 _EXACT = {"sensor_noise_m": 0.0, "heading_noise_rad": 0.0}  # of a robot's sensors in training, which poses do not show
@@ -74,30 +68,6 @@ def c_files(description: Mapping[str, Any]) -> dict[str, bytes]:
         "max_speed": literal(robot["max_wheel_speed_rad_s"]),
     }
     return {name: filled(name, **values) for name in ("esp_epuck.h", "esp_epuck.c")}
-
-
-def project_files(kind: str, policy: Mapping[str, bytes], settings: Mapping[str, Any]) -> dict[str, bytes]:
-    """Return a project of Webots or a package of ROS 2 (`kind` is "webots" or "ros2") around a policy in Python."""
-    side, radius = settings["arena_m"], settings["obstacle_radius_m"]
-    arena = Arena(side, settings["num_agents"], settings["num_obstacles"], radius)
-    pillars = arena.pillars().tolist()
-    if kind == "webots":
-        folder = "controllers/esp_epuck_webots"
-        robots = [(x, y, math.atan2(-y, -x)) for x, y in arena.posts().tolist()]
-        lengths = {"side": f"{side:g}", "height": f"{1.5 * side:g}", "radius": f"{radius:g}"}
-        world = filled("formation.wbt", release=_WEBOTS_RELEASE, pillars=pillars, robots=robots, **lengths)
-        around = {"worlds/formation.wbt": world}
-    else:
-        folder = ROS2_PACKAGE
-        shown = [round(x, 4) for place in pillars for x in place]
-        values = {"package": ROS2_PACKAGE, "version": __version__, "pillars": shown}
-        names = {"package.xml": "", "setup.cfg": "", "setup.py": "", "formation.launch.py": "launch/"}
-        around = {f"{place}{name}": filled(name, **values) for name, place in names.items()}
-        init = b'"""An exported policy and the node that drives e-pucks by it."""\n'
-        around |= {f"resource/{ROS2_PACKAGE}": b"", f"{ROS2_PACKAGE}/__init__.py": init}
-    # Read, not imported: the drivers import what only a robot's machine has.
-    drivers = {name: (RUNTIME / name).read_bytes() for name in ("esp_epuck.py", f"esp_epuck_{kind}.py")}
-    return {f"{folder}/{name}": content for name, content in {**policy, **drivers}.items()} | around
 
 
 @dataclass(frozen=True)

@@ -87,42 +87,10 @@ def _c(job: Job) -> Files:
     return files if job.scenes is None else files | epuck.c_files(job.description)
 
 
-def _policy(job: Job) -> Files:
-    return {"policy.py": numpy_source(job.program, summary(job.trained, job.program), job.description)}
-
-
 def _numpy(job: Job) -> Files:
+    source = numpy_source(job.program, summary(job.trained, job.program), job.description)
     beside = {} if job.scenes is None else {"esp_epuck.py": (RUNTIME / "esp_epuck.py").read_bytes()}
-    return _policy(job) | beside
-
-
-def _robot(job: Job, kind: str) -> Files:
-    spec = job.trained.spec
-    prior = job.trained.config.prior.effective()
-    if compass := prior.compass:
-        label = f" and the agent's number, from {-compass:g} to {compass:g}" if "agents" in prior.transforms else ""
-        raise UserError(
-            f"webots and ros2 build what a robot sees from poses, and know no compass; train without prior.compass, or "
-            f"export numpy or c and end each observation with {compass:g}, 0, 0, {compass:g}{label}"
-        )
-    if "robot" not in job.description:
-        raise UserError(f"webots and ros2 drive e-pucks, but this policy is for {spec.name}; export one of formation")
-    if not epuck.builds_observations(spec.settings):
-        raise UserError(
-            "webots and ros2 build what a robot sees from poses, without heading_offset_rad and blind_sector_rad; "
-            "train without them, or export numpy or c"
-        )
-    if job.program.memory_width:
-        raise UserError("webots and ros2 take policies that remember nothing; export one without --network gru")
-    return epuck.project_files(kind, _policy(job), spec.settings)
-
-
-def _run_numpy(folder: Path, _: Program) -> Runner:
-    return numpy_runner(folder / "policy.py")
-
-
-def _observe_in_python(_: Path, job: Job) -> epuck.Observer:
-    return epuck.python_observer(job.description)
+    return {"policy.py": source} | beside
 
 
 FORMATS = {
@@ -135,9 +103,11 @@ FORMATS = {
         lambda folder, program: c_file.c_runner(folder / "policy.c", program),
         lambda folder, job: epuck.c_observer(folder, job.program.num_inputs),
     ),
-    "numpy": Format(_numpy, _run_numpy, _observe_in_python),
-    "webots": Format(lambda job: _robot(job, "webots"), _run_numpy, _observe_in_python),
-    "ros2": Format(lambda job: _robot(job, "ros2"), _run_numpy, _observe_in_python),
+    "numpy": Format(
+        _numpy,
+        lambda folder, _: numpy_runner(folder / "policy.py"),
+        lambda _, job: epuck.python_observer(job.description),
+    ),
 }
 """The formats by name; `esp export` lists them without importing them, and -f policy beside them."""
 

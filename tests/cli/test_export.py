@@ -73,12 +73,11 @@ def test_the_folder_that_comes_along_is_listed() -> None:
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (["-f", "tflite"], "there is no format 'tflite'; the formats are onnx, c, numpy, webots, ros2, policy"),
+        (["-f", "tflite"], "there is no format 'tflite'; the formats are onnx, c, numpy, policy"),
         (["-f", "policy", "-f", "c"], "-f policy bundles a policy; leave out the other formats"),
         (["-f", "c", "--name", "mine"], "--name is for -f policy alone"),
         (["-f", "c", "--seed", "4"], "has no seed 4; it has 3, 7"),
         (["-f", "c", "--algo", "mappo"], "--algo and --prior choose among a task's policies"),
-        (["-f", "ros2", "--seed", "3"], "drive e-pucks, but this policy is for navigation"),
         ([], "Missing option '--format'"),
     ],
 )

@@ -1,15 +1,10 @@
-"""What surrounds an exported policy on an e-puck: observations from poses, safety stops, Webots' and ROS 2's files."""
+"""What surrounds an exported policy on an e-puck: observations from poses and safety stops."""
 
 from __future__ import annotations
 
 import ctypes
-import re
-import runpy
-import sys
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -17,7 +12,6 @@ import pytest
 from esp_cli.export import c_file, check, epuck
 from esp_cli.export.esp_epuck import PATIENCE_S, Pilot
 from esp_cli.export.export import export
-from esp_envs.epuck.robot import Arena
 from tests.export.policies import drawn_policy, imported
 
 needs_cc = pytest.mark.skipif(c_file.compiler() is None, reason="needs a C compiler")
@@ -161,81 +155,6 @@ def test_a_robot_driven_by_c_needs_the_bodies_that_it_sees(compiled) -> None:
     assert driven(compiled[0], 0, robots=1) == (0, [0.0, 0.0])
     assert driven(compiled[0], 0, pillars=PILLARS[:0]) == (0, [0.0, 0.0]), "it sees the offset of a pillar"
     assert driven(compiled[0], 0)[0] == 1
-
-
-def exported(folder: Path, form: str, monkeypatch: pytest.MonkeyPatch) -> Path:
-    take = epuck.take_scenes
-    monkeypatch.setattr(epuck, "take_scenes", lambda trained: take(trained, 20))
-    export(drawn_policy("wheels"), [form], folder)
-    return folder
-
-
-def test_the_webots_world_has_the_team_where_the_task_starts_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    text = (exported(tmp_path, "webots", monkeypatch) / "worlds" / "formation.wbt").read_text()
-    assert text.startswith("#VRML_SIM R2023b utf8\n")
-    for opening, closing in ("{}", "[]"):
-        assert text.count(opening) == text.count(closing) > 0
-    arena = Arena(2.0, 8, 2, 0.05)
-    found = re.findall(r"DEF (ROBOT|PILLAR)(\d+) [\w-]+ {\n  translation (\S+) (\S+) ", text)
-    for name, places in (("ROBOT", arena.posts()), ("PILLAR", arena.pillars())):
-        own = {int(k): (float(x), float(y)) for kind, k, x, y in found if kind == name}
-        assert list(own) == list(range(len(places)))
-        assert np.allclose(list(own.values()), places, atol=1e-4)
-    assert text.count("supervisor TRUE") == 8
-    (controller,) = set(re.findall(r'controller "(\w+)"', text))
-    assert (tmp_path / "controllers" / controller / f"{controller}.py").is_file()
-    assert 100 % int(re.search(r"basicTimeStep (\d+)", text)[1]) == 0
-
-
-def test_the_ros_2_package_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = exported(tmp_path, "ros2", monkeypatch)
-    manifest = ElementTree.parse(folder / "package.xml").getroot()
-    name = manifest.findtext("name")
-    assert (manifest.tag, manifest.get("format"), name) == ("package", "3", "esp_formation")
-    assert all(manifest.findtext(part) for part in ("version", "description", "maintainer", "license"))
-    assert manifest.findtext("export/build_type") == "ament_python"
-    needed = {part.text for part in manifest.findall("exec_depend")}
-    node = (folder / name / "esp_epuck_ros2.py").read_text()
-    imported = set(re.findall(r"^from (\w+)\.msg|^import (rclpy)", node, re.MULTILINE))
-    assert {first or second for first, second in imported} <= needed
-    assert (folder / "resource" / name).is_file()
-    asked: dict = {}
-    setuptools = ModuleType("setuptools")
-    setuptools.setup = lambda **given: asked.update(given)
-    monkeypatch.setitem(sys.modules, "setuptools", setuptools)
-    runpy.run_path(str(folder / "setup.py"))
-    assert asked["packages"] == [name]
-    assert all((folder / file).is_file() for _, files in asked["data_files"] for file in files)
-    (script,) = asked["entry_points"]["console_scripts"]
-    assert script == f"drive = {name}.esp_epuck_ros2:main"
-    assert f"script_dir=$base/lib/{name}" in (folder / "setup.cfg").read_text()
-
-
-def test_the_launch_file_starts_the_node_of_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    file = exported(tmp_path, "ros2", monkeypatch) / "launch" / "formation.launch.py"
-
-    def recorded(name: str):
-        return lambda *args, **kwargs: (name, args, kwargs)
-
-    for module, names in {
-        "launch": ["LaunchDescription"],
-        "launch.actions": ["DeclareLaunchArgument"],
-        "launch.substitutions": ["LaunchConfiguration"],
-        "launch_ros": [],
-        "launch_ros.actions": ["Node"],
-    }.items():
-        fake = ModuleType(module)
-        for name in names:
-            setattr(fake, name, recorded(name))
-        monkeypatch.setitem(sys.modules, module, fake)
-    space = runpy.run_path(str(file))
-    _, ((argument, node),), _ = space["generate_launch_description"]()
-    assert argument[:2] == ("DeclareLaunchArgument", ("poses",))
-    assert (node[2]["package"], node[2]["executable"]) == ("esp_formation", "drive")
-    assert node[2]["remappings"] == [("poses", ("LaunchConfiguration", ("poses",), {}))]
-    assert np.allclose(node[2]["parameters"][0]["pillars"], Arena(2.0, 8, 2, 0.05).pillars().ravel(), atol=1e-4)
 
 
 def test_what_remembers_goes_out_without_poses(tmp_path: Path) -> None:

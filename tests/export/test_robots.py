@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import shutil
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -21,8 +22,8 @@ from esp_envs.epuck.robot import MAX_WHEEL_SPEED, drive
 from tests.export.policies import drawn_policy
 
 STEPS = 40
-EXPORTED = ("policy", "esp_epuck", "esp_epuck_webots", "esp_formation")
-WEBOTS = Path("controllers") / "esp_epuck_webots"
+BESIDE = ("policy", "esp_epuck", "epuck_webots", "epuck_ros2")
+DOCS = Path(__file__).parents[2] / "docs"
 pytestmark = pytest.mark.usefixtures("few_scenes")
 
 
@@ -50,11 +51,13 @@ class Team:
 
 
 def imported(folder: Path, name: str, monkeypatch: pytest.MonkeyPatch, **fakes: ModuleType) -> ModuleType:
-    """Import an exported file as its robot's machine would, with other modules beside it."""
+    """Import an exported file, or a driver of docs/ beside it, as its robot's machine would, with other modules."""
     for other, module in fakes.items():
         monkeypatch.setitem(sys.modules, other, module)
-    for other in [known for known in sys.modules if known.split(".")[0] in EXPORTED]:
+    for other in [known for known in sys.modules if known in BESIDE]:
         monkeypatch.delitem(sys.modules, other)
+    for driver in DOCS.glob("epuck_*.py"):
+        shutil.copy(driver, folder)
     monkeypatch.syspath_prepend(folder)
     return importlib.import_module(name)
 
@@ -91,8 +94,8 @@ SETTINGS = {
 @pytest.mark.parametrize("case", SETTINGS)
 def test_robots_see_what_the_task_shows(case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trained = drawn_policy(**SETTINGS[case])
-    export(trained, ["webots"], tmp_path)
-    module = imported(tmp_path / WEBOTS, "esp_epuck", monkeypatch)
+    export(trained, ["numpy"], tmp_path)
+    module = imported(tmp_path, "esp_epuck", monkeypatch)
     policy = importlib.import_module("policy")
     pilot, team = module.Pilot(policy.DESCRIPTION, policy.act), Team(trained)
     for _ in range(5):
@@ -109,8 +112,8 @@ def test_robots_see_what_the_task_shows(case: str, tmp_path: Path, monkeypatch: 
 
 
 def test_what_a_robot_cannot_see_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    export(drawn_policy("wheels"), ["ros2"], tmp_path)
-    module = imported(tmp_path / "esp_formation", "esp_epuck", monkeypatch)
+    export(drawn_policy("wheels"), ["numpy"], tmp_path)
+    module = imported(tmp_path, "esp_epuck", monkeypatch)
     policy = importlib.import_module("policy")
     pilot = module.Pilot(policy.DESCRIPTION, policy.act)
     poses, goals = np.zeros((2, 3)), np.zeros((2, 2))
@@ -123,12 +126,9 @@ def test_what_a_robot_cannot_see_is_told(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("setting", ["heading_offset_rad", "blind_sector_rad"])
-def test_what_is_not_built_from_poses_is_not_exported_for_robots(tmp_path: Path, setting: str) -> None:
-    trained = drawn_policy("wheels", **{setting: 1.0})
-    for kind in ("ros2", "webots"):
-        with pytest.raises(ValueError, match=r"without heading_offset_rad and blind_sector_rad; train without them"):
-            export(trained, [kind], tmp_path)
-    export(trained, ["numpy"], tmp_path)
+def test_what_is_not_built_from_poses_is_exported_without_a_pilot(tmp_path: Path, setting: str) -> None:
+    export(drawn_policy("wheels", **{setting: 1.0}), ["numpy"], tmp_path)
+    assert not (tmp_path / "esp_epuck.py").exists()
     assert "from poses" not in (tmp_path / "README.md").read_text()
 
 
@@ -184,7 +184,7 @@ def test_the_webots_controller_drives_as_the_policy_does(
     case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trained = drawn_policy(**SETTINGS[case])
-    export(trained, ["webots"], tmp_path)
+    export(trained, ["numpy"], tmp_path)
     team = Team(trained)
     wheels, paths = np.zeros((len(team.poses), 2)), [team.poses]
 
@@ -197,12 +197,12 @@ def test_the_webots_controller_drives_as_the_policy_does(
         return 0 if len(paths) <= STEPS else -1
 
     first = robot(team, 0, wheels, advance)
-    module = imported(tmp_path / WEBOTS, "esp_epuck_webots", monkeypatch, controller=fake(Supervisor=lambda: first))
+    module = imported(tmp_path, "epuck_webots", monkeypatch, controller=fake(Supervisor=lambda: first))
     pilot = module.Pilot(sys.modules["policy"].DESCRIPTION, sys.modules["policy"].act)
     # goals are opposite to the posts, from which the start is up to a centimetre away
     goals = [tuple(goal) for goal in team.goals]
     others = [module.Driver(robot(team, k, wheels), pilot, goals[k]) for k in range(1, len(team.poses))]
-    monkeypatch.setattr(sys, "argv", ["esp_epuck_webots.py", *map(str, goals[0])])
+    monkeypatch.setattr(sys, "argv", ["epuck_webots.py", *map(str, goals[0])])
     module.main()
     assert len(paths) == STEPS + 1
     gap = np.abs(np.stack(paths)[..., :2] - trained_paths(trained, team)[..., :2]).max()
@@ -214,10 +214,10 @@ def test_the_webots_controller_drives_as_the_policy_does(
 def test_without_arguments_a_webots_robot_drives_to_the_opposite_of_its_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    export(drawn_policy("wheels"), ["webots"], tmp_path)
+    export(drawn_policy("wheels"), ["numpy"], tmp_path)
     team = SimpleNamespace(poses=np.array([[0.3, 0.2, 1.0], [0.9, -0.5, 2.0]]), pillars=np.zeros((1, 0, 2)))
     second = robot(team, 1, np.zeros((2, 2)), lambda: -1)
-    module = imported(tmp_path / WEBOTS, "esp_epuck_webots", monkeypatch, controller=fake(Supervisor=lambda: second))
+    module = imported(tmp_path, "epuck_webots", monkeypatch, controller=fake(Supervisor=lambda: second))
     asked = []
 
     def wheels(poses, goals, pillars) -> np.ndarray:
@@ -226,15 +226,15 @@ def test_without_arguments_a_webots_robot_drives_to_the_opposite_of_its_start(
 
     monkeypatch.setattr(module, "Pilot", lambda *_: SimpleNamespace(control_period_s=0.1, wheels=wheels))
     for arguments in ([], ["0.5", "-0.3"]):
-        monkeypatch.setattr(sys, "argv", ["esp_epuck_webots.py", *arguments])
+        monkeypatch.setattr(sys, "argv", ["epuck_webots.py", *arguments])
         module.main()
     assert asked == [(-0.9, 0.5), (0.5, -0.3)]
 
 
 def test_no_motor_is_asked_for_more_than_it_can(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    export(drawn_policy("wheels"), ["webots"], tmp_path)
+    export(drawn_policy("wheels"), ["numpy"], tmp_path)
     team, wheels = SimpleNamespace(poses=np.zeros((1, 3)), pillars=np.zeros((1, 0, 2))), np.zeros((1, 2))
-    module = imported(tmp_path / WEBOTS, "esp_epuck_webots", monkeypatch, controller=fake(Supervisor=None))
+    module = imported(tmp_path, "epuck_webots", monkeypatch, controller=fake(Supervisor=None))
     pilot = SimpleNamespace(wheels=lambda *_: np.array([[6.28, -5.0]]))
     module.Driver(robot(team, 0, wheels, most=4.0), pilot).act()
     assert wheels.tolist() == [[4.0, -4.0]]
@@ -242,10 +242,10 @@ def test_no_motor_is_asked_for_more_than_it_can(tmp_path: Path, monkeypatch: pyt
 
 def test_a_webots_world_that_does_not_fit_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trained = drawn_policy("wheels")
-    export(trained, ["webots"], tmp_path)
+    export(trained, ["numpy"], tmp_path)
     team = Team(trained)
     odd = robot(team, 0, np.zeros((8, 2)))
-    module = imported(tmp_path / WEBOTS, "esp_epuck_webots", monkeypatch, controller=fake(Supervisor=lambda: odd))
+    module = imported(tmp_path, "epuck_webots", monkeypatch, controller=fake(Supervisor=lambda: odd))
     odd.getBasicTimeStep = lambda: 32.0
     with pytest.raises(ValueError, match=r"basicTimeStep is 32\.0 ms; take a divisor of 100 ms"):
         module.main()
@@ -319,7 +319,7 @@ def ros_poses(poses: np.ndarray, stamp_s: int = 0) -> SimpleNamespace:
 
 def test_the_ros_node_drives_as_the_policy_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trained = drawn_policy("wheels")
-    export(trained, ["ros2"], tmp_path)
+    export(trained, ["numpy"], tmp_path)
     team, paths = Team(trained), []
     parameters = {"goals": team.goals.ravel().tolist(), "pillars": team.pillars.ravel().tolist()}
     monkeypatch.setattr(RosNode, "parameters", parameters)
@@ -362,7 +362,7 @@ def test_the_ros_node_drives_as_the_policy_does(tmp_path: Path, monkeypatch: pyt
         raise KeyboardInterrupt
 
     nodes: list[RosNode] = []
-    module = imported(tmp_path, "esp_formation.esp_epuck_ros2", monkeypatch, **ros_fakes(spin))
+    module = imported(tmp_path, "epuck_ros2", monkeypatch, **ros_fakes(spin))
     module.main()
     assert nodes[0].speeds() == [[0.0, 0.0]] * 8, "interrupted robots stand still"
     gap = np.abs(np.stack(paths)[..., :2] - trained_paths(trained, team)[..., :2]).max()
@@ -372,8 +372,8 @@ def test_the_ros_node_drives_as_the_policy_does(tmp_path: Path, monkeypatch: pyt
 def test_a_ros_node_without_goals_takes_the_opposite_of_the_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    export(drawn_policy("wheels"), ["ros2"], tmp_path)
-    module = imported(tmp_path, "esp_formation.esp_epuck_ros2", monkeypatch, **ros_fakes())
+    export(drawn_policy("wheels"), ["numpy"], tmp_path)
+    module = imported(tmp_path, "epuck_ros2", monkeypatch, **ros_fakes())
     driver = module.Driver()
     driver.see(ros_poses(np.array([[math.nan, -0.5, 1.0], [0.1, 0.2, -3.0]])))
     assert driver.goals == [], "a start that is not finite tells no goal"
@@ -395,9 +395,9 @@ def test_a_ros_node_without_goals_takes_the_opposite_of_the_start(
 def test_a_ros_node_stops_a_team_of_another_size_than_its_goals(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    export(drawn_policy("wheels"), ["ros2"], tmp_path)
+    export(drawn_policy("wheels"), ["numpy"], tmp_path)
     monkeypatch.setattr(RosNode, "parameters", {"goals": [0.5, 0.0, -0.5, 0.0]})
-    driver = imported(tmp_path, "esp_formation.esp_epuck_ros2", monkeypatch, **ros_fakes()).Driver()
+    driver = imported(tmp_path, "epuck_ros2", monkeypatch, **ros_fakes()).Driver()
     driver.see(ros_poses(np.array([[0.9, -0.5, 1.0], [0.1, 0.2, -3.0], [0.0, 0.6, 0.0]])))
     driver.act()
     assert driver.speeds() == [[0.0, 0.0]] * 3

@@ -310,15 +310,6 @@ def test_a_gate_of_an_earlier_version_is_read_and_trains_no_more(tmp_path: Path)
     assert Run(tmp_path / "old").evaluate(2).episodes == 2
 
 
-def test_a_robots_program_takes_no_policy_with_a_compass(tmp_path: Path) -> None:
-    small = ("--set", "mappo.num_envs=2", "--set", "mappo.num_minibatches=1", "--set", "mappo.num_epochs=1")
-    esp("train", "--task", "formation", "--steps", "600", "--seeds", "1", "--out", tmp_path / "run", *small,
-        "--set", "prior.compass=0.5", "--set", "evaluation.episodes=2")  # fmt: skip
-    said = refused("export", tmp_path / "run", "-f", "webots", "-o", tmp_path / "out")
-    assert "know no compass" in said
-    assert "end each observation with 0.5, 0, 0, 0.5" in said
-
-
 def test_a_policy_with_a_compass_is_evaluated_drawn_and_exported_as_any_other(tmp_path: Path) -> None:
     train_small(tmp_path / "run", "mappo", "--set", "prior.compass=1")
     assert TrainedPolicy.read(tmp_path / "run").spec.observation.width == 18

@@ -1,9 +1,10 @@
 """Webots controller: an e-puck of a team that changes formation by an exported policy. Untested on hardware.
 
-worlds/formation.wbt beside it has such a team. In a world of your own (2023a or newer: z is up), give the e-pucks the
-DEF names ROBOT0, ROBOT1, ... without a gap, pillars PILLAR0, PILLAR1, ..., and each e-puck this controller with
-`supervisor TRUE`, through which it learns where everybody is. The control period has to be a multiple of
-basicTimeStep: 10 or 20 ms do. Robots stand still where a pose is not finite.
+It stands in a project's folder controllers/epuck_webots beside policy.py and esp_epuck.py, which
+`esp export formation -f numpy` writes. In your world (2023a or newer: z is up) the e-pucks have the DEF names ROBOT0,
+ROBOT1, ... without a gap, pillars PILLAR0, PILLAR1, ..., and each e-puck has this controller and `supervisor TRUE`,
+through which it learns where everybody is. The control period has to be a multiple of basicTimeStep: 10 or 20 ms do.
+Robots stand still where a pose is not finite.
 
 A robot's goal is opposite to where it starts, seen from the middle of the arena, unless controllerArgs names one as
 two numbers (m): ["0.5", "-0.3"].

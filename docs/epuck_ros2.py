@@ -1,6 +1,6 @@
 """ROS 2 node: drives a team of e-pucks that changes formation by an exported policy. Untested on hardware.
 
-The package around it starts it: `colcon build`, then `ros2 launch esp_formation formation.launch.py`.
+It stands beside policy.py and esp_epuck.py, which `esp export formation -f numpy` writes: `python epuck_ros2.py`.
 
 Subscribes to
     poses (geometry_msgs/PoseArray): all robots in the order of their numbers, in the arena's frame (metres, z up),
@@ -22,9 +22,9 @@ import math
 from itertools import chain
 from typing import Any
 
+import policy
 import rclpy
-from esp_formation import policy
-from esp_formation.esp_epuck import Pilot
+from esp_epuck import Pilot
 from geometry_msgs.msg import PoseArray, Twist
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.node import Node
