@@ -126,9 +126,6 @@ def restore_generators(generators: Sequence[torch.Generator], states: Tensor) ->
         generator.set_state(state.cpu().clone())
 
 
-_ONCE_GREEDY = ("nearest", "chase")  # heuristics that scripts and files of 0.1 call so
-
-
 def put_back(env: Environment, observation: Observation) -> None:
     """Put worlds back to the last observation of their episodes, for a picture; draws no random numbers."""
     states = generator_states(env.generators)
@@ -230,7 +227,7 @@ class Environment(ABC):
     def named_heuristic(self, name: str | None) -> str:
         """Return a heuristic's name with its default filled in; a UserError refuses unknown ones."""
         name = name or self.heuristics[0]
-        if name == "greedy" and self.heuristics[0] in _ONCE_GREEDY:  # which now names a mode of learned policies alone
+        if name == "greedy" and self.heuristics[0] in ("nearest", "chase"):  # which scripts and files of 0.1 call so
             name = self.heuristics[0]
         if name not in self.heuristics:
             raise UserError(f"{self.spec.name} has no heuristic '{name}'; it has {', '.join(self.heuristics)}")
@@ -282,13 +279,6 @@ class Environment(ABC):
         """
         mask = self.action_mask()
         return joined([_drawn(self, role, role.own_mask(mask, where)) for role, where in self.spec.parts])
-
-    def half_by_heuristic(self, action: Tensor) -> Tensor:
-        """Return a joint action whose first half of the worlds follows the main heuristic, if the task has one."""
-        action, half = action.clone(), self.num_envs // 2
-        if self.heuristics:
-            action[:, :half] = self.heuristic()[:, :half]
-        return action
 
 
 def _drawn(env: Environment, spec: TaskSpec, mask: Tensor | None) -> Tensor:

@@ -41,7 +41,10 @@ def visit(env: Environment, watch: Watch, until: float) -> list[tuple[Tensor, Te
         action = env.random_action()
         if t in taken:
             visited.append((observation.state.clone(), action))
-        observation = env.step(env.half_by_heuristic(action)).next
+        steered, half = action.clone(), env.num_envs // 2
+        if env.heuristics:
+            steered[:, :half] = env.heuristic()[:, :half]
+        observation = env.step(steered).next
         watch(t + 1, max(taken) + 1, "steps")
     return visited
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 
 from esp_cli.checking import check_symmetry
-from esp_cli.checking.stepping import outcomes
+from esp_cli.checking.stepping import outcomes, visit
 from esp_cli.checking.verdicts import LATE, ElementVerdict, verdicts_of
 from esp_cli.symmetry import build_transform, parse_elements
 from esp_envs import BatchedTask, Field, Kind, generators_for, layout, make, register
+from esp_envs.base import Step
 from esp_envs.spec import TaskSpec
 from esp_envs.views import OthersAtRandom, RoleView, worlds_of_role
 from tests.envs.chase import STEPS, Chase
@@ -161,3 +164,18 @@ def test_what_nobody_declared_ends_first() -> None:
     judge = lambda element: ElementVerdict(element.name, False, ())  # noqa: E731
     found = verdicts_of(elements, judge, lambda element: element.name == "flip-x", spare=0.0)
     assert [one.reason for one in found] == [LATE, ""]
+
+
+def test_half_of_the_worlds_follows_the_heuristic(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = make("navigation", 4, [0, 1])
+    steps, step = [], env.step
+
+    def spied(action: torch.Tensor) -> Step:
+        steps.append((env.heuristic(), action))
+        return step(action)
+
+    monkeypatch.setattr(env, "step", spied)
+    (_, drawn), *_ = visit(env, lambda *_: None, math.inf)
+    assert all(torch.equal(wise[:, :2], action[:, :2]) for wise, action in steps)
+    assert torch.equal(steps[0][1][:, 2:], drawn[:, 2:])
+    assert not torch.equal(steps[0][1], drawn), "the control"

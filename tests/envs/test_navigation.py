@@ -156,18 +156,6 @@ def test_cover_is_left_out_where_it_cannot_enumerate() -> None:
         env.heuristic("cover")
 
 
-def test_half_of_the_worlds_follows_the_heuristic() -> None:
-    env = make("navigation", 4, [0, 1])
-    env.reset()
-    drawn = env.random_action()
-    before = drawn.clone()
-    mixed = env.half_by_heuristic(drawn)
-    assert torch.equal(mixed[:, :2], env.heuristic()[:, :2])
-    assert torch.equal(mixed[:, 2:], drawn[:, 2:])
-    assert torch.equal(drawn, before)
-    assert not torch.equal(mixed, drawn), "the control"
-
-
 def test_the_former_name_of_a_heuristic_still_names_it() -> None:
     for task, name in (("navigation", "nearest"), ("predator-prey", "chase")):
         env = make(task, 1, [0])
