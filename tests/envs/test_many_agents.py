@@ -1,4 +1,4 @@
-"""Navigation with many agents: pairs by broadcasting, neighbours alone, one density, and an assignment that scales."""
+"""Tasks with many agents: pairs by broadcasting, neighbours alone, one density, and an assignment that scales."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 
 from esp_cli.training.build import ScriptedController, play
 from esp_envs import make
-from esp_envs.mpe import covering, many
+from esp_envs.mpe import covering, many, predator_prey_spec
 
 
 @pytest.mark.parametrize("settings", [{}, {"convention": "pettingzoo"}, {"num_landmarks": 4}, {"reward_offset": 0.5}])
@@ -47,6 +47,55 @@ def test_what_a_tree_finds_is_what_all_pairs_show(monkeypatch):
         torch.testing.assert_close(here.next.obs, there.next.obs, atol=1e-4, rtol=0)
         for name, value in here.metrics.items():
             torch.testing.assert_close(value, there.metrics[name], atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("settings", [{}, {"prey": "fleeing", "num_obstacles": 0}, {"control": "both"}])
+def test_predators_by_broadcasting_are_those_of_the_list(monkeypatch, settings):
+    few = make("predator-prey", 5, [0, 1], {**settings, "num_predators": 5})
+    monkeypatch.setattr(predator_prey_spec, "MOST_BODIES", 1)
+    many = make("predator-prey", 5, [0, 1], {**settings, "num_predators": 5})
+    many.set_state(few.reset().state)
+    many.prey_moves.copy_(few.prey_moves)
+    touches = 0.0
+    for _ in range(15):
+        action = few.heuristic()
+        here, there = few.step(action), many.step(action)
+        torch.testing.assert_close(here.next.obs, there.next.obs, atol=1e-3, rtol=0)
+        torch.testing.assert_close(here.reward, there.reward, atol=1e-2, rtol=0)
+        touches += float(here.metrics["touches"].sum())
+    assert touches > 10
+
+
+def test_what_a_tree_finds_of_predators_is_what_all_pairs_show(monkeypatch):
+    settings = {"num_predators": 30, "num_obstacles": 9, "sees": 4, "density": 30.0}
+    pairs, tree = (make("predator-prey", 3, [0, 1], settings) for _ in range(2))
+    state = pairs.reset().state
+    pairs.prey_moves.zero_()
+    tree.prey_moves.zero_()
+    for _ in range(10):
+        action = pairs.heuristic()
+        monkeypatch.setattr(many, "BY_TREE", 1)
+        tree.set_state(state)
+        there = tree.step(action)
+        monkeypatch.setattr(many, "BY_TREE", 99)
+        pairs.set_state(state)
+        here = pairs.step(action)
+        torch.testing.assert_close(here.next.state, there.next.state, atol=1e-4, rtol=0)
+        torch.testing.assert_close(here.next.obs, there.next.obs, atol=1e-4, rtol=0)
+        state = here.next.state
+
+
+def test_a_predator_sees_the_nearest_first():
+    """Predators at x = 0, 1, 3, the prey at 10, obstacles at x = 5, -2."""
+    env = make("predator-prey", 1, [0], {"num_predators": 3, "sees": 1})
+    x = [0.0, 1.0, 3.0, 10.0, 5.0, -2.0]
+    state = torch.tensor([0.0] * 8 + [part for place in x for part in (place, 0.0)])
+    seen = env.set_state(state.view(1, 1, -1)).obs[0, 0]
+    # velocity, position, the nearest obstacle, the nearest other, the prey and its velocity
+    assert seen[0].tolist() == [0, 0, 0, 0, -2, 0, 1, 0, 10, 0, 0, 0]
+    assert seen[2].tolist() == [0, 0, 3, 0, 2, 0, -2, 0, 7, 0, 0, 0]
+    whole = make("predator-prey", 1, [0]).spec.observation
+    assert env.spec.observation.without_counts == whole.without_counts
 
 
 def test_contacts_happen_in_what_is_compared_above():
@@ -96,6 +145,12 @@ def test_density_says_how_large_the_square_is():
     for places in (position, landmarks):  # 32 agents on a square of side 4: half of it is 2
         assert 1.9 < places.abs().max() <= 2.0
     assert make("navigation", 50, [0], {"num_agents": 32}).reset().state[..., 64:128].abs().max() <= 1.0
+
+
+def test_walls_of_an_arena_grow_with_the_robots():
+    env = make("formation", 1, [0], {"num_agents": 16, "density": 2.0})
+    assert env.settings.arena.side_m == env.spec.settings["arena_m"] == 2.0
+    assert make("formation", 1, [0]).settings.arena.side_m == 2.0
 
 
 def by_brute_force(position, landmark):
@@ -148,8 +203,11 @@ def test_the_hand_written_policy_beats_chance_with_fifty_agents():
     ("task", "settings"),
     [
         ("predator-prey", {"num_predators": 24}),
+        ("predator-prey", {"num_predators": 300, "sees": 8, "density": 8.0, "num_obstacles": 60}),
         ("wildlife", {"num_agents": 60, "width": 21, "height": 21}),
+        ("wildlife", {"num_agents": 300, "width": 21, "height": 21}),
         ("formation", {"num_agents": 24, "arena_m": 5.0}),
+        ("formation", {"num_agents": 80, "density": 1.0, "neighbours": 20}),
     ],
 )
 def test_the_other_tasks_take_many_agents_too(task, settings):

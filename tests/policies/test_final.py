@@ -128,5 +128,5 @@ def test_more_episodes_than_fit_at_once_are_played_in_batches(tmp_path, monkeypa
 
 def test_a_recurrent_policy_of_another_task_is_evaluated(tmp_path):
     result = evaluate(untrained(tmp_path, (3,), task="predator-prey", network__name="gru"), 2)
-    assert set(result.metrics) == {"contact", "touches"}
+    assert set(result.metrics) == {"contact", "touches", "prey_distance"}
     assert result.greedy.sem is None

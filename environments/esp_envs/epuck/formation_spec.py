@@ -39,10 +39,13 @@ class FormationSettings(TaskSettings):
     physics: Literal["mujoco", "mujoco-3d", "pymunk"] = Setting(
         "mujoco", description="planar MuJoCo, MuJoCo with wheels and casters, or pymunk"
     )
-    num_agents: int = Setting(8, ge=1, le=64, description="N, robots")
-    num_obstacles: int = Setting(2, ge=0, le=8, description="M, pillars on a ring around the middle")
+    num_agents: int = Setting(8, ge=1, le=10_000, description="N, robots")
+    num_obstacles: int = Setting(2, ge=0, le=10_000, description="M, pillars on a ring around the middle")
     obstacle_radius_m: float = Setting(0.05, gt=0, le=1, description="of a pillar, m")
-    arena_m: float = Setting(2.0, gt=0, le=20, description="length of a wall, m")
+    arena_m: float = Setting(2.0, gt=0, le=1000, description="length of a wall, m")
+    density: float | None = Setting(
+        None, gt=0, description="robots per metre of wall, however many there are; by default walls have arena_m"
+    )
     horizon: int = Setting(300, ge=1, le=100_000, description="control steps of an episode")
     control_period_s: float = Setting(0.1, gt=0, le=1, description="time of a control step, s; a multiple of 0.01")
     sight: Literal["offset", "nearness"] | None = Setting(
@@ -55,7 +58,7 @@ class FormationSettings(TaskSettings):
         gt=0,
         description="the goal is seen in this unit and no farther than one of it, m; by default by its offset in m",
     )
-    neighbours: int = Setting(1, ge=1, le=15, description="nearest robots that an observation shows; paper: 1")
+    neighbours: int = Setting(1, ge=1, description="nearest robots that an observation shows; paper: 1")
     progress_weight: float = Setting(100.0, ge=0, description="omega_g, reward per metre nearer to the goal")
     collision_penalty: float | None = Setting(
         None, ge=0, description="c_collision, reward lost in a step with a body too near; 0.35 by default, 1 in tight"
@@ -91,7 +94,8 @@ class FormationSettings(TaskSettings):
     )
 
     def without_effect(self) -> frozenset[str]:
-        return frozenset({"obstacle_radius_m"} if self.num_obstacles == 0 else ())
+        idle = {"obstacle_radius_m"} if self.num_obstacles == 0 else set()
+        return frozenset(idle | ({"arena_m"} if self.density else set()))
 
     @property
     def penalty(self) -> float:
@@ -130,7 +134,8 @@ class FormationSettings(TaskSettings):
 
     @property
     def arena(self) -> Arena:
-        return Arena(self.arena_m, self.num_agents, self.num_obstacles, self.obstacle_radius_m)
+        side = self.arena_m if self.density is None else self.num_agents / self.density / 4
+        return Arena(side, self.num_agents, self.num_obstacles, self.obstacle_radius_m)
 
     @model_validator(mode="after")
     def _fits(self) -> FormationSettings:
@@ -174,7 +179,12 @@ def formation_spec(settings: FormationSettings) -> TaskSpec:
         hidden=settings.hidden,
         totals=("arrival_rate", "time_to_arrival_s", "collisions", "path_length_m", "final_distance_m"),
         settings=settings.model_dump()
-        | {"penalty_radius_m": settings.radius, "collision_penalty": settings.penalty, "sight": settings.seen_as},
+        | {
+            "arena_m": settings.arena.side_m,
+            "penalty_radius_m": settings.radius,
+            "collision_penalty": settings.penalty,
+            "sight": settings.seen_as,
+        },
     )
 
 

@@ -18,26 +18,38 @@ class ManyWorlds(ParticleWorlds):
     """W worlds in which all agents push each other apart; arguments as of `ParticleWorlds`, without lists of pairs.
 
     Args:
-        sees: of the other agents and of the landmarks, how many nearest ones each agent sees; 0 for all.
+        sees: of the others in the crowd and of the landmarks, how many nearest ones each of the crowd sees; 0 for all.
+        crowd: the first agents, which see each other; all by default.
+        solid: whether landmarks push agents away.
 
     Attributes:
         touching: [A, W'] other agents that touch each agent.
         squared_to_landmarks: [L, W'] from each landmark to its nearest agent.
-        seen_agents: [W, A, k] index of the nearest others, the nearest first; None where all are seen.
-        seen_landmarks: [W, A, k] likewise.
+        seen_agents: [W, crowd, k] index of the nearest others, the nearest first; None where all are seen.
+        seen_landmarks: [W, crowd, k] likewise.
     """
 
-    def __init__(self, bodies: Bodies, num_worlds: int, device: torch.device, velocity_first: bool, sees: int) -> None:
+    def __init__(
+        self,
+        bodies: Bodies,
+        num_worlds: int,
+        device: torch.device,
+        velocity_first: bool,
+        sees: int,
+        crowd: int | None = None,
+        solid: bool = False,
+    ) -> None:
         agents, landmarks = bodies.num_agents, bodies.num_landmarks
-        self._sees = (min(sees, agents - 1), min(sees, landmarks))
-        self._reach = 2 * bodies.radius[0]
+        self._crowd, self._num_solid = crowd or agents, agents + landmarks * solid
+        self._sees = (min(sees, self._crowd - 1), min(sees, landmarks))
+        self._radius = torch.tensor(bodies.radius, dtype=torch.float64, device=device)
         size = max(1, _PAIRS // (agents * (agents + landmarks)))
         self._chunks = [slice(k, min(k + size, num_worlds)) for k in range(0, num_worlds, size)]
-        lanes, index = lanes_of(num_worlds), torch.int64
+        lanes, seen = lanes_of(num_worlds), (num_worlds, self._crowd)
         self.touching = torch.zeros(agents, lanes, device=device)
         self.squared_to_landmarks = torch.zeros(landmarks, lanes, device=device)
         self.seen_agents, self.seen_landmarks = (
-            torch.zeros(num_worlds, agents, count, dtype=index, device=device) if sees else None for count in self._sees
+            torch.zeros(*seen, count, dtype=torch.int64, device=device) if sees else None for count in self._sees
         )
         super().__init__(bodies, num_worlds, device, velocity_first)
 
@@ -53,19 +65,21 @@ class ManyWorlds(ParticleWorlds):
         self._near = torch.cat(near, 1)
 
     def _measure_all(self, worlds: slice) -> Tensor:
-        """Look at all pairs of some worlds; return (world, agent, agent) of those that are near, [3, P]."""
-        agents = self.bodies.num_agents
+        """Look at all pairs of some worlds; return (world, agent, body) of those that are near, [3, P]."""
+        agents, crowd, solid = self.bodies.num_agents, self._crowd, self._num_solid
         x, y = self.entity[:, :, worlds].permute(1, 2, 0).contiguous()  # [w, bodies] each
         square = (x[:, :agents, None] - x[:, None]).square_()
         square += (y[:, :agents, None] - y[:, None]).square_()
-        others, landmarks = square[:, :, :agents], square[:, :, agents:]
-        others.diagonal(dim1=1, dim2=2).fill_(torch.inf)
-        self.touching[:, worlds] = (others < self._reach**2).sum(2).t().to(x.dtype)
-        self.squared_to_landmarks[:, worlds] = landmarks.amin(1).t()
+        square.diagonal(dim1=1, dim2=2).fill_(torch.inf)
+        reach = self._radius[:agents, None] + self._radius
+        touch = square[:, :, :agents] < reach[:, :agents].square().to(x.dtype)
+        self.touching[:, worlds] = touch.sum(2).t().to(x.dtype)
+        self.squared_to_landmarks[:, worlds] = square[:, :, agents:].amin(1).t()
         if self.seen_agents is not None and self.seen_landmarks is not None:
-            self.seen_agents[worlds] = _nearest(others, self._sees[0])
-            self.seen_landmarks[worlds] = _nearest(landmarks, self._sees[1])
-        world, first, second = (others < (self._reach + _NO_PUSH) ** 2).nonzero().unbind(1)
+            self.seen_agents[worlds] = _nearest(square[:, :crowd, :crowd], self._sees[0])
+            self.seen_landmarks[worlds] = _nearest(square[:, :crowd, agents:], self._sees[1])
+        near = square[:, :, :solid] < (reach[:, :solid] + _NO_PUSH).square().to(x.dtype)
+        world, first, second = near.nonzero().unbind(1)
         return torch.stack([world + worlds.start, first, second])
 
     def _measure_by_tree(self, world: int) -> Tensor:
@@ -74,33 +88,46 @@ class ManyWorlds(ParticleWorlds):
 
         assert self.seen_agents is not None
         assert self.seen_landmarks is not None
-        agents = self.bodies.num_agents
+        agents, solid = self.bodies.num_agents, self._num_solid
         entity = self.entity[:, :, world].contiguous()
-        position, landmark = entity[:agents], entity[agents:]
-        tree, others, landmarks = KDTree(position.numpy()), *self._sees
-        found = torch.from_numpy(tree.query(position.numpy(), k=range(1, others + 2))[1])
-        itself = found == torch.arange(agents).unsqueeze(1)  # once in a row, unless many are in one place
-        self.seen_agents[world] = found.gather(1, itself.int().argsort(dim=1, stable=True)[:, :others])
-        ranks = range(1, landmarks + 1)
-        self.seen_landmarks[world] = torch.from_numpy(KDTree(landmark.numpy()).query(position.numpy(), k=ranks)[1])
-        nearest = position[torch.from_numpy(tree.query(landmark.numpy())[1])]
-        self.squared_to_landmarks[:, world] = (nearest - landmark).square().sum(1)
-        pairs = torch.from_numpy(tree.query_pairs(self._reach + _NO_PUSH, output_type="ndarray")).long()
+        crowd, landmark = entity[: self._crowd], entity[agents:]
+        found = torch.from_numpy(KDTree(crowd.numpy()).query(crowd.numpy(), k=range(1, self._sees[0] + 2))[1])
+        itself = found == torch.arange(len(crowd)).unsqueeze(1)  # once in a row, unless many are in one place
+        self.seen_agents[world] = found.gather(1, itself.int().argsort(dim=1, stable=True)[:, : self._sees[0]])
+        if len(landmark):
+            ranks = range(1, self._sees[1] + 1)
+            self.seen_landmarks[world] = torch.from_numpy(KDTree(landmark.numpy()).query(crowd.numpy(), k=ranks)[1])
+            nearest = entity[torch.from_numpy(KDTree(entity[:agents].numpy()).query(landmark.numpy())[1])]
+            self.squared_to_landmarks[:, world] = (nearest - landmark).square().sum(1)
+        most = float(self._radius[:agents].max() + self._radius[:solid].max())
+        pairs = KDTree(entity[:solid].numpy()).query_pairs(most + _NO_PUSH, output_type="ndarray")
+        pairs = torch.from_numpy(pairs).long()
         pairs = torch.cat([pairs, pairs.flip(1)])
-        touch = (position[pairs[:, 0]] - position[pairs[:, 1]]).square().sum(1) < self._reach**2
-        self.touching[:, world] = torch.bincount(pairs[touch, 0], minlength=agents).float()
+        pairs = pairs[pairs[:, 0] < agents]
+        first, second = pairs.unbind(1)
+        square = (entity[first] - entity[second]).square().sum(1)
+        touch = (square < (self._radius[first] + self._radius[second]).square()) & (second < agents)
+        self.touching[:, world] = torch.bincount(first[touch], minlength=agents).float()
         return torch.cat([torch.full((1, len(pairs)), world), pairs.t()])
 
     def _contact_impulses(self) -> Tensor:
-        (world, first, second), position = self._near, self.position
-        offset = position[first, :, world] - position[second, :, world]
+        world, first, second = self._near
+        offset = self.entity[first, :, world] - self.entity[second, :, world]
         padding = (0, -len(offset) % 64)  # vector code and its scalar tail round otherwise
         square = torch.nn.functional.pad(offset.square().sum(1), padding, value=1.0)
-        touching = square.new_tensor(self._reach / CONTACT_MARGIN)
-        push = offset * contact_strength(square, touching)[: len(offset), None]
+        touching = ((self._radius[first] + self._radius[second]) / CONTACT_MARGIN).to(square.dtype)
+        strength = contact_strength(square, torch.nn.functional.pad(touching, padding))
+        push = offset * strength[: len(offset), None]
         change = torch.zeros(2, self.velocity[:, 0].numel(), device=push.device)
         change.scatter_add_(1, (first * self.num_lanes + world).expand(2, -1), push.t())
         return change.view(2, *self.velocity[:, 0].shape).transpose(0, 1)
+
+
+def ways_to(seen: Tensor | None, places: Tensor, here: Tensor) -> Tensor:
+    """Return the ways [S, E, C, k, 2] from agents at `here` [S, E, C, 2] to those of places that they see [W, C, k]."""
+    assert seen is not None
+    which = seen.view(*here.shape[:2], -1, 1).expand(-1, -1, -1, 2)
+    return places.gather(2, which).unflatten(2, (here.shape[2], -1)) - here.unsqueeze(3)
 
 
 def _nearest(square: Tensor, count: int) -> Tensor:

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from esp_envs.batched import World, to_others
 from esp_envs.mpe import covering
-from esp_envs.mpe.many import MOST_BODIES, ManyWorlds
+from esp_envs.mpe.many import MOST_BODIES, ManyWorlds, ways_to
 from esp_envs.mpe.particles import Bodies, ParticleWorlds
-from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings, ParticleTask
+from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings, ParticleTask, half_side
 from esp_envs.scene import DARK, Body, Scene, look
 from esp_envs.spec import Field, Items, Kind, TaskSpec, filled_layout, layout
 
@@ -65,7 +65,7 @@ class NavigationSettings(ParticleSettings):
     @property
     def half_side(self) -> float:
         """Half the side of the square in which agents start, lengths."""
-        return math.sqrt(self.num_agents / self.density) if self.density else 1.0
+        return half_side(self.num_agents, self.density)
 
     @property
     def seen(self) -> tuple[int, int]:
@@ -207,17 +207,15 @@ class Navigation(ParticleTask):
 
     def _observe(self, world: World) -> Tensor:
         velocity, position, landmarks = world["velocity"], world["position"], world["landmarks"]
-        if self.settings.sees:
-            seen = (self._nearest("seen_landmarks", landmarks), self._nearest("seen_agents", position))
+        if self.settings.sees and isinstance(self.worlds, ManyWorlds):
+            worlds = self.worlds
+            seen = (
+                ways_to(worlds.seen_landmarks, landmarks, position),
+                ways_to(worlds.seen_agents, position, position),
+            )
         else:
             seen = (landmarks.unsqueeze(-3) - position.unsqueeze(-2), to_others(position))
         return torch.cat([velocity, position, *(ways.flatten(-2) for ways in seen)], -1)
-
-    def _nearest(self, index: str, places: Tensor) -> Tensor:
-        """Return where each agent sees the nearest of places [S, E, K, 2]: [S, E, N, k, 2]."""
-        which = getattr(self.worlds, index).view(*self._worlds_shape, -1, 1).expand(-1, -1, -1, 2)
-        ways = places.gather(2, which).unflatten(2, (self.settings.num_agents, -1))
-        return ways - self.world["position"].unsqueeze(3)
 
     def heuristic(self, name: str | None = None) -> Tensor:
         """Return the joint action of `nearest` (default) or `cover`."""

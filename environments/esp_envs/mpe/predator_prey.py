@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import ClassVar
@@ -12,7 +13,8 @@ from torch import Tensor
 from esp_envs.base import joined
 from esp_envs.batched import World, to_others
 from esp_envs.mpe.frozen_prey import FrozenPrey
-from esp_envs.mpe.particles import Bodies
+from esp_envs.mpe.many import ManyWorlds, ways_to
+from esp_envs.mpe.particles import Bodies, ParticleWorlds
 from esp_envs.mpe.predator_prey_spec import PredatorPreySettings, predator_prey_spec, prey_layout
 from esp_envs.mpe.task import MOVES, ParticleTask, nearest_move, unit_disc
 from esp_envs.scene import COLORS, PALE, Body, Scene, look
@@ -77,7 +79,11 @@ class PredatorPrey(ParticleTask):
 
     Terminated: never. Truncated: after `horizon` = 25 steps; bootstrap there.
 
-    Metrics a step: `contact` (1 where any predator touches the prey), `touches` (their number).
+    Many predators: with `sees` = k a predator sees the k nearest obstacles and other predators, sorted by distance;
+    `density` makes the square at the start, and the prey's bounds, grow with them. A learning prey sees all.
+
+    Metrics a step: `contact` (1 where any predator touches the prey), `touches` (their number), `prey_distance` (from
+    the prey to its nearest predator, length).
 
     Symmetry: dynamics and reward are invariant under all rotations and reflections; discrete moves carry `d4`, forces
     `o2`. The prey's own bounds are a square, so `control="prey"` has `d4` only. A learned prey (`policy`,
@@ -120,17 +126,25 @@ class PredatorPrey(ParticleTask):
 
     def _bodies(self) -> Bodies:
         predators, obstacles = self.settings.num_predators, self.settings.num_obstacles
-        agents = predators + 1
-        touches = tuple((a, predators) for a in range(predators))
-        shoves = [(a, b) for a in range(predators) for b in range(a + 1, predators)]
-        bumps = [(a, agents + k) for a in range(agents) for k in range(obstacles)]
+        agents, half = predators + 1, self.settings.half_side
+        pairs: list[tuple[int, int]] = []
+        if not self.settings.many:
+            pairs += [(a, predators) for a in range(predators)]  # touches first
+            pairs += itertools.combinations(range(predators), 2)
+            pairs += itertools.product(range(agents), range(agents, agents + obstacles))
         return Bodies(
             radius=(PREDATOR_RADIUS,) * predators + (PREY_RADIUS,) + (OBSTACLE_RADIUS,) * obstacles,
             gain=(PREDATOR_GAIN,) * predators + (PREY_GAIN,),
             max_speed=(PREDATOR_MAX_SPEED,) * predators + (PREY_MAX_SPEED,),
-            contacts=(*touches, *shoves, *bumps),
-            extent=(1.0,) * agents + (OBSTACLE_EXTENT,) * obstacles,
+            contacts=tuple(pairs),
+            extent=(half,) * agents + (half * OBSTACLE_EXTENT,) * obstacles,
         )
+
+    def _make_worlds(self, bodies: Bodies, num_worlds: int, velocity_first: bool) -> ParticleWorlds:
+        if not self.settings.many:
+            return super()._make_worlds(bodies, num_worlds, velocity_first)
+        crowd, sees = self.settings.num_predators, self.settings.sees
+        return ManyWorlds(bodies, num_worlds, self.device, velocity_first, sees, crowd, solid=True)
 
     @property
     def prey_moves(self) -> Tensor:
@@ -142,7 +156,13 @@ class PredatorPrey(ParticleTask):
         if self.settings.control == "prey":
             return prey_sees
         here, prey, velocity = world["position"], world["prey_position"], world["velocity"]
-        parts = [velocity, here, self._obstacles_from(here, world), to_others(here).flatten(-2)]
+        if self.settings.sees and isinstance(self.worlds, ManyWorlds):
+            seen = [ways_to(self.worlds.seen_agents, here, here).flatten(-2)]
+            if "obstacles" in world:
+                seen.insert(0, ways_to(self.worlds.seen_landmarks, world["obstacles"], here).flatten(-2))
+        else:
+            seen = [self._obstacles_from(here, world), to_others(here).flatten(-2)]
+        parts = [velocity, here, *seen]
         rows = torch.cat([*parts, prey - here, world["prey_velocity"].expand_as(here)], -1)
         return joined([rows, prey_sees]) if self._prey_learns else rows
 
@@ -174,7 +194,8 @@ class PredatorPrey(ParticleTask):
         (x, y), touching = places[predators], PREDATOR_RADIUS + PREY_RADIUS
         prey = Body((x, y), PREY_RADIUS, COLORS[1], trail=True, label="prey", reach=touching, held="caught")
         bodies.append(prey)
-        return Scene(tuple(bodies), (-1.4, 1.4, -1.4, 1.4), unit="length units")
+        half = 1.4 * self.settings.half_side
+        return Scene(tuple(bodies), (-half, half, -half, half), unit="length units")
 
     def _to_save(self) -> dict[str, Tensor]:
         follows = {"follows": self._follows} if self.settings.learned_prey else {}
@@ -224,17 +245,27 @@ class PredatorPrey(ParticleTask):
 
     def _flight(self) -> Tensor:
         predators, position = self.settings.num_predators, self.worlds.position
-        return flee(position[:predators], position[predators]).unsqueeze(0)
+        return flee(position[:predators], position[predators], BOUND * self.settings.half_side).unsqueeze(0)
 
     def _outcome(self) -> tuple[Tensor, dict[str, Tensor]]:
         predators = self.settings.num_predators
-        touches = paid = _touches(self.worlds.squared_contact_distance[:predators])
+        if self.settings.many:
+            position = self.worlds.position
+            offset = (position[:predators] - position[predators]).square_()
+            square = offset[:, 0] + offset[:, 1]
+        else:
+            square = self.worlds.squared_contact_distance[:predators]
+        touches = paid = _touches(square)
         if self.settings.reward_offset:
             paid = _touches(self._squared_to(self.worlds.position[predators:])[:predators, 0])
-        metrics = {"contact": touches.clamp_max(1.0), "touches": touches}
+        metrics = {
+            "contact": touches.clamp_max(1.0),
+            "touches": touches,
+            "prey_distance": square.amin(0).sqrt(),
+        }
         reward = paid * TOUCH_REWARD
         if self._prey_learns:
-            hunted = -reward - out_of_bounds(self.worlds.position[predators]).sum(0)
+            hunted = -reward - out_of_bounds(self.worlds.position[predators] / self.settings.half_side).sum(0)
             both = torch.cat([reward.expand(predators, -1), hunted.unsqueeze(0)])
             reward = hunted if self.settings.control == "prey" else both
         return reward, metrics
@@ -256,11 +287,11 @@ def chase(predator: Tensor, predator_velocity: Tensor, prey: Tensor, prey_veloci
     return URGENCY * (prey + PREY_LEAD_S * prey_velocity - predator - OWN_LEAD_S * predator_velocity)
 
 
-def flee(predator: Tensor, prey: Tensor) -> Tensor:
+def flee(predator: Tensor, prey: Tensor, bound: float = BOUND) -> Tensor:
     """Return the wish [2, W] of a prey: from the nearest of predators [N, 2, W], or back when out of bounds."""
     away = prey - predator
     squared = away.square().sum(1, keepdim=True)
     nearest = squared.argmin(0, keepdim=True).expand(1, 2, -1)
     direction = away.gather(0, nearest)[0] / squared.amin(0).clamp_min(_TINY).sqrt()
-    outside = prey.square().sum(0) > BOUND**2
+    outside = prey.square().sum(0) > bound**2
     return _FAR * torch.where(outside, -prey, direction)

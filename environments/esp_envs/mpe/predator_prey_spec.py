@@ -9,7 +9,8 @@ from pydantic import Field as Setting
 from pydantic import field_validator, model_validator
 
 from esp_envs.errors import UserError
-from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings
+from esp_envs.mpe.many import MOST_BODIES
+from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings, half_side
 from esp_envs.roles import Role, spec_with_roles
 from esp_envs.settings import Breaks
 from esp_envs.spec import Field, Items, Kind, Layout, TaskSpec, filled_layout
@@ -18,8 +19,19 @@ from esp_envs.spec import Field, Items, Kind, Layout, TaskSpec, filled_layout
 class PredatorPreySettings(ParticleSettings):
     """What a user may change of `predator-prey`."""
 
-    num_predators: int = Setting(3, ge=1, le=64, description="predators; 3 in the paper")
-    num_obstacles: int = Setting(2, ge=0, le=8, description="fixed discs; 2 in MPE, 3 by the authors' launcher")
+    num_predators: int = Setting(3, ge=1, le=100_000, description="predators; 3 in the paper")
+    num_obstacles: int = Setting(2, ge=0, le=100_000, description="fixed discs; 2 in MPE, 3 by the authors' launcher")
+    sees: int = Setting(
+        0,
+        ge=0,
+        description="of the other predators and of the obstacles, how many nearest ones one sees; 0: all",
+    )
+    density: float | None = Setting(
+        None,
+        gt=0,
+        description="predators per 2 x 2 lengths at the start, however many there are; by default all start in "
+        "[-1, 1]^2. Obstacles, and the bounds of the prey, grow with the square",
+    )
     control: Literal["predators", "prey", "both"] = Setting(
         "predators",
         description="who learns; with 'prey' the predators follow the heuristic `chase`, with 'both' each side learns",
@@ -39,6 +51,16 @@ class PredatorPreySettings(ParticleSettings):
     @classmethod
     def _found_from_anywhere(cls, path: str | None) -> str | None:
         return path and str(Path(path).absolute())
+
+    @property
+    def half_side(self) -> float:
+        """Half the side of the square in which agents start, lengths."""
+        return half_side(self.num_predators, self.density)
+
+    @property
+    def many(self) -> bool:
+        """Whether pairs are too many to be listed, or only the nearest are seen."""
+        return self.sees > 0 or self.num_predators >= MOST_BODIES
 
     @property
     def turns(self) -> str:
@@ -91,11 +113,21 @@ def predator_prey_spec(settings: PredatorPreySettings) -> TaskSpec:
 
 
 def _predator_layout(settings: PredatorPreySettings) -> Layout:
+    others, obstacles, sees = settings.num_predators - 1, settings.num_obstacles, settings.sees
+    if sees:  # sorted by distance, so that no order of predators moves them
+        seen = (
+            Field("near_obstacles", Kind.VECTOR, min(sees, obstacles), "length", family="obstacles"),
+            Field("near_predators", Kind.VECTOR, min(sees, others), "length", family="others"),
+        )
+    else:
+        seen = (
+            Field("obstacles", Kind.VECTOR, obstacles, "length", family="obstacles"),
+            Field("predators", Kind.VECTOR, others, "length", Items.OTHERS),
+        )
     return filled_layout(
         Field("velocity", Kind.VECTOR, 1, "length/s"),
         Field("position", Kind.VECTOR, 1, "length", is_point=True),
-        Field("obstacles", Kind.VECTOR, settings.num_obstacles, "length", family="obstacles"),
-        Field("predators", Kind.VECTOR, settings.num_predators - 1, "length", Items.OTHERS),
+        *seen,
         Field("prey", Kind.VECTOR, 1, "length", family="prey"),
         Field("prey_velocity", Kind.VECTOR, 1, "length/s", family="prey"),
     )

@@ -67,6 +67,11 @@ class ParticleSettings(TaskSettings):
         return "c4" if self.actions == "discrete" else "so2"
 
 
+def half_side(agents: int, density: float | None) -> float:
+    """Return half the side of the square in which agents start, lengths, with `density` of them per 2 x 2 lengths."""
+    return math.sqrt(agents / density) if density else 1.0
+
+
 class ParticleTask(BatchedTask):
     """A batch of particle worlds.
 
