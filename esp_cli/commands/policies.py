@@ -52,9 +52,11 @@ def _print(entries: Sequence[Entry]) -> None:
                 f"{e.seed} of {e.chosen_from}",
                 f"{e.score.mean:.2f}",
                 console.format_interval(e.score.ci95),
+                "-" if e.normalised is None else f"{e.normalised:.2f}",
             )
             for e in group
         ]
         title = f"{task} version {version}, {episodes} episodes; convention {convention}"
-        console.table(("policy", "steps>", "seed>", "return>", "95 % interval>"), rows, title=title)
+        console.table(("policy", "steps>", "seed>", "return>", "95 % interval>", "normalised>"), rows, title=title)
     console.text("Greedy, interval over episodes; the seed is the best of its run on other episodes.")
+    console.text("Normalised: 0 the random policy, 1 the best hand-written one.")

@@ -46,6 +46,7 @@ class Entry(Strict):
     chosen_from: int = Field(ge=1, description="seeds of the run, of which this one did best")
     step: int = Field(ge=0, description="environment steps behind it")
     score: Score
+    normalised: float | None = Field(None, description="the score, 0 the random policy, 1 the best hand-written one")
     metrics: dict[str, float]
     command: str = Field(description="that trains such a run")
     esp_version: str

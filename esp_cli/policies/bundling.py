@@ -12,10 +12,10 @@ import torch
 from esp_cli.defaults import __version__
 from esp_cli.files.opening import taking_turns
 from esp_cli.policies.bundled import NAME_PATTERN, Entry, Score, read_bundled, standard_name, write_bundled
-from esp_cli.policies.evaluation import play_batches
+from esp_cli.policies.evaluation import play_batches, play_references
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.policies.statistics import spread_over_episodes
-from esp_cli.training.build import Episodes, PolicyController
+from esp_cli.training.build import Episodes, PolicyController, build_environment
 from esp_cli.training.checkpoint import describe_policy, write_policy
 from esp_cli.training.folder_names import CONFIG
 from esp_envs.errors import UserError
@@ -38,6 +38,15 @@ def score_of(episodes: Episodes) -> Score:
     if spread.sem is None or spread.ci95 is None:
         raise UserError("these episodes all brought the same return, or there is only one; a score needs more of them")
     return Score(mean=float(returns.mean()), sem=spread.sem, ci95=spread.ci95, episodes=returns.size)
+
+
+def normalised_of(own: TrainedPolicy, score: Score) -> float | None:
+    """Return a score between those of the random policy, 0, and of the best heuristic, 1, on as many episodes."""
+    names = build_environment(own.config, 1, "shape").heuristics
+    played = play_references(own, names, score.episodes)
+    low, *by_hand = (float(episodes.returns.mean()) for episodes in played.values())
+    best = max(by_hand, default=low)
+    return (score.mean - low) / (best - low) if best > low else None
 
 
 def play_greedily(trained: TrainedPolicy, episodes: int) -> Episodes:
@@ -80,6 +89,7 @@ def bundle(
             chosen_from=len(config.seeds),
             step=own.step,
             score=score,
+            normalised=normalised_of(own, score),
             metrics={key: float(value.mean()) for key, value in played.metrics.items()},
             command=config.command(),
             esp_version=__version__,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from operator import methodcaller
 from typing import Any
 
@@ -74,10 +75,7 @@ def evaluate(trained: TrainedPolicy, episodes: int) -> FinalEvaluation:
         for numbers in (played.returns, *played.metrics.values()):
             numbers[list(trained.stopped)] = float("nan")
     one_world = build_environment(trained.config, 1, _STREAM, "shape")
-    names = one_world.heuristics
-    anchors = {"random": play_batches(trained, ScriptedController(methodcaller("random_action")), "random", episodes)}
-    for key, name in zip(("heuristic", *names[1:]), names, strict=False):
-        anchors[key] = play_batches(trained, ScriptedController(methodcaller("heuristic", name)), "heuristic", episodes)
+    names, anchors = one_world.heuristics, play_references(trained, one_world.heuristics, episodes)
     spread = dict(anchors)
     if len(seeds) == 1 and not trained.stopped:
         spread |= {"greedy": greedy, "stochastic": stochastic}
@@ -102,6 +100,14 @@ def evaluate(trained: TrainedPolicy, episodes: int) -> FinalEvaluation:
         flops_per_action=flops_per_action(trained.policy, one_world.reset().obs),
         over_episodes={name: spread_over_episodes(played.returns.flatten().cpu()) for name, played in spread.items()},
     )
+
+
+def play_references(trained: TrainedPolicy, names: Sequence[str], episodes: int) -> dict[str, Episodes]:
+    """Play the random policy and the task's heuristics: "random", "heuristic" for the first, others by name."""
+    anchors = {"random": play_batches(trained, ScriptedController(methodcaller("random_action")), "random", episodes)}
+    for key, name in zip(("heuristic", *names[1:]), names, strict=False):
+        anchors[key] = play_batches(trained, ScriptedController(methodcaller("heuristic", name)), "heuristic", episodes)
+    return anchors
 
 
 @torch.no_grad()

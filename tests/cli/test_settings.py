@@ -41,7 +41,11 @@ def test_bounds_units_presets_and_tasks_are_told() -> None:
     rates = {"fast on navigation": 4e-3, "fast on predator-prey": 4e-3}
     rate, envs, arena = found["mappo.learning_rate"], found["mappo.num_envs"], found["task.arena_m"]
     assert (rate.type, rate.bounds, rate.presets) == ("number", "above 0", {"paper": 7e-4} | rates)
-    assert (envs.bounds, envs.unit, envs.tasks) == ("from 1", "worlds", {"formation": 8, "wildlife": 64, "quadruped": 256})
+    assert (envs.bounds, envs.unit, envs.tasks) == (
+        "from 1",
+        "worlds",
+        {"formation": 8, "wildlife": 64, "quadruped": 256},
+    )
     assert (arena.bounds, arena.unit) == ("above 0 to 20", "m")
     assert found["mappo.critic_input"].bounds == "state, observations, own"
 

@@ -10,15 +10,17 @@ import shutil
 import threading
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import torch
 
 from esp_cli.commands.counts import parse_count, parse_seeds
 from esp_cli.commands.options import parse_assignments
 from esp_cli.files.opening import taking_turns
 from esp_cli.policies import bundled, bundling
-from esp_cli.policies.bundled import MANIFEST, Entry, bundled_folder, find, read_bundled, standard_name
-from esp_cli.policies.bundling import best_seed, bundle, play_greedily, score_of
+from esp_cli.policies.bundled import MANIFEST, Entry, Score, bundled_folder, find, read_bundled, standard_name
+from esp_cli.policies.bundling import best_seed, bundle, normalised_of, play_greedily, score_of
 from esp_cli.policies.evaluation import evaluate
 from esp_cli.policies.loading import TrainedPolicy, load_entry, open_policy
 from esp_cli.training.build import Episodes
@@ -277,3 +279,19 @@ def test_two_exports_into_one_folder_take_turns(tmp_path: Path) -> None:
     other.join()
     assert order == ["first", "second"]
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_normalised_score_is_0_for_the_random_and_1_for_the_best_hand_written_policy(monkeypatch) -> None:
+    trained = open_policy(Path("navigation")).single_seed()
+    played = [SimpleNamespace(returns=torch.full((1, 2), value)) for value in (-200.0, -120.0, -100.0)]
+    found = dict(zip(("random", "heuristic", "cover"), played, strict=True))
+    monkeypatch.setattr(bundling, "play_references", lambda *_: found)
+    score = {"sem": 1.0, "ci95": (0.0, 1.0), "episodes": 2}
+    scores = [normalised_of(trained, Score(mean=mean, **score)) for mean in (-200.0, -150.0, -100.0)]
+    assert scores == [0.0, 0.5, 1.0]
+    monkeypatch.setattr(bundling, "play_references", lambda *_: {"random": found["random"]})
+    assert normalised_of(trained, Score(mean=-150.0, **score)) is None, "nothing by hand, no scale"
+
+
+def test_the_scores_on_file_are_normalised() -> None:
+    assert all(0.7 < entry.normalised < 3 for entry in read_bundled())
