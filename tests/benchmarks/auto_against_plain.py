@@ -65,7 +65,8 @@ def trained(task: str, recipe: int, kind: str, steps: int, seeds: int) -> tuple[
     for number in range(iterations):
         learner.iterate(number / iterations)
     worlds = build_environment(config, EPISODES, "evaluation")
-    return play(worlds, PolicyController(learner.policy)).returns.mean(-1).tolist(), dict(config.prior.weights)
+    returns = play(worlds, PolicyController(learner.policy)).returns.mean(-1).tolist()
+    return [round(value, 4) for value in returns], dict(config.prior.weights)
 
 
 def main() -> None:
@@ -87,8 +88,9 @@ def main() -> None:
         rows.append(row | {"difference": gain, "weights": weights, "seconds": round(time.process_time() - begun, 1)})
         print(recipe, row["reward"], gain, sum(weight > 0 for weight in weights.values()), "weighed", flush=True)
         if args.json:
-            told = {"steps": args.steps, "seeds": args.seeds, "episodes": EPISODES, "tasks": rows}
-            args.json.write_text(json.dumps(told, indent=1, default=vars) + "\n")
+            told = json.dumps({"steps": args.steps, "seeds": args.seeds, "episodes": EPISODES})
+            lines = ",\n".join(json.dumps(row, default=vars) for row in rows)
+            args.json.write_text(f'{told[:-1]}, "tasks": [\n{lines}\n]}}\n')
 
 
 if __name__ == "__main__":
