@@ -22,7 +22,7 @@ EPILOG = """Examples:\n
     esp export runs/cn-mappo -f onnx -f numpy -o cn-export\n
     esp export runs/cn-mappo -f policy -o checkpoints"""
 
-FORMATS = ("onnx", "c", "numpy", "policy")
+FORMATS = ("onnx", "torch", "c", "numpy", "policy")
 
 
 def export(
@@ -58,7 +58,7 @@ def export(
     force: options.ForceOption = False,
     json: options.JsonOption = None,
 ) -> None:
-    """Write a policy for other programs (ONNX, C99, numpy), checked against the policy itself.
+    """Write a policy for other programs (ONNX, torch.export, C99, numpy), checked against the policy itself.
 
     Every export brings the layout and the units of its observation, the meaning of its actions, and a worked example.
     Of a task whose agents have roles each role's policy gets a folder.

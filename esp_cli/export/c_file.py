@@ -44,7 +44,9 @@ def cost(program: Program) -> Cost:
 def c_source(program: Program, comment: str) -> dict[str, bytes]:
     """Write a program as a source and a header that begins with a comment."""
     if program.team > 1 and program.head != "choose":
-        raise UserError("C export of agents that exchange messages supports discrete actions only; use onnx or numpy")
+        raise UserError(
+            "C export of agents that exchange messages supports discrete actions only; use onnx, torch or numpy"
+        )
     body = _body(program)
     comment = comment.replace("*/", "* /").replace("/*", "/ *")
     values = {

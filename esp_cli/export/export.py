@@ -22,6 +22,7 @@ from esp_cli.export.numpy_file import numpy_runner, numpy_source
 from esp_cli.export.onnx_file import onnx_model, onnx_runner
 from esp_cli.export.program import Program, program_of
 from esp_cli.export.templates import RUNTIME, filled
+from esp_cli.export.torch_file import torch_archive, torch_runner
 from esp_cli.files.documents import parse_object
 from esp_cli.files.opening import read_regular, require_held, taking_turns
 from esp_cli.files.writing import replace_file
@@ -97,6 +98,10 @@ FORMATS = {
     "onnx": Format(
         lambda job: {"policy.onnx": onnx_model(job.program, json.dumps(job.description))},
         lambda folder, _: onnx_runner(folder / "policy.onnx"),
+    ),
+    "torch": Format(
+        lambda job: {"policy.pt2": torch_archive(job.program, json.dumps(job.description))},
+        lambda folder, _: torch_runner(folder / "policy.pt2"),
     ),
     "c": Format(
         _c,

@@ -1,4 +1,4 @@
-"""The kinds of layers that exports know, each with its form in C and ONNX.
+"""The kinds of layers that exports know, each with its form in C, ONNX and torch.
 
 A kind is a function here, an entry of `LAYERS` in `numpy_policy.py` and a function of `layers.c`.
 """
@@ -7,15 +7,21 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn import functional as F
 
 from esp_envs.spec import others_of
 
 Floats = NDArray[np.float32]
+
+NORM_EPSILON = 1e-5  # layer normalisation adds this to the variance, as torch does by default
 
 
 @dataclass(frozen=True)
@@ -23,13 +29,15 @@ class Layer:
     """One step of a program: rows x to rows y.
 
     In C (in the macros of `templates/policy.c.jinja`) and ONNX (its text format, an operation a line) w0, w1, ... stand
-    for the arrays; in ONNX numbers stand for constants.
+    for the arrays; in ONNX numbers stand for constants. `torch` makes y [rows, width] of x, the arrays, and the
+    observations [rows, D]; the kind `gru` takes the hidden state [rows, H] instead of the latter, `sets` the tables.
     """
 
     kind: str  # its name in JSON
     flops: int  # for one row: each addition, multiplication, comparison or call of tanh, exp or sqrt is one
     c: str
     onnx: str
+    torch: Callable[[Tensor, list[Tensor], Any], Tensor]
     arrays: tuple[Floats, ...] = ()  # learned numbers, in the order in which exports store them
     onnx_arrays: tuple[Floats, ...] = ()  # what ONNX stores instead of them, where that differs
     numbers: tuple[tuple[str, object], ...] = ()  # what JSON says of it, beside the shapes of the arrays
@@ -49,6 +57,7 @@ def affine(weight: Floats, bias: Floats) -> Layer:
         flops=2 * weight.size,
         c=f"EACH affine(w0, w1, {inputs}, {outputs}, X, Y);\nSWAP;",
         onnx="y = Gemm(x, w0, w1)",
+        torch=lambda x, w, _: torch.addmm(w[1], x, w[0]),
         arrays=(weight, bias),
         width=max(inputs, outputs),
     )
@@ -61,6 +70,7 @@ def norm(weight: Floats, bias: Floats) -> Layer:
         flops=8 * weight.size,  # a number: sums for mean and variance (1 + 3), then four operations
         c=f"EACH normalise(w0, w1, {weight.size}, X);",
         onnx="y = LayerNormalization<axis = -1, epsilon = 0.00001>(x, w0, w1)",
+        torch=lambda x, w, _: F.layer_norm(x, x.shape[-1:], w[0], w[1], NORM_EPSILON),
         arrays=(weight, bias),
     )
 
@@ -72,6 +82,7 @@ def activation(kind: Literal["relu", "tanh"], width: int) -> Layer:
         flops=width,
         c=f"EACH apply_{kind}(X, {width});",
         onnx=f"y = {kind.capitalize()}(x)",
+        torch=lambda x, *_: torch.relu(x) if kind == "relu" else torch.tanh(x),
         numbers=(("width", width),),
     )
 
@@ -82,6 +93,13 @@ def gru(weight: Floats, bias: Floats, hidden_weight: Floats, hidden_bias: Floats
     p = x W + b and q = h U + c, each in the order r, z, n; W, b, U, c in the order of the arguments.
     """
     size = len(hidden_weight)
+
+    def advance(x: Tensor, w: list[Tensor], hidden: Tensor) -> Tensor:
+        pr, pz, pn = torch.addmm(w[1], x, w[0]).chunk(3, -1)
+        qr, qz, qn = torch.addmm(w[3], hidden, w[2]).chunk(3, -1)
+        reset, update = torch.sigmoid(pr + qr), torch.sigmoid(pz + qz)
+        candidate = torch.tanh(pn + reset * qn)
+        return candidate + update * (hidden - candidate)
 
     return Layer(
         "gru",
@@ -107,6 +125,7 @@ def gru(weight: Floats, bias: Floats, hidden_weight: Floats, hidden_bias: Floats
             difference = Sub(hidden, candidate)
             step = Mul(update, difference)
             y = Add(candidate, step)""",
+        torch=advance,
         arrays=(weight, bias, hidden_weight, hidden_bias),
     )
 
@@ -118,6 +137,7 @@ def cut(begin: int, end: int) -> Layer:
         flops=0,
         c=f"EACH memmove(X, X + {begin}, sizeof(float) * ({end} - {begin}));",
         onnx=f"y = Slice(x, [{begin}], [{end}], [1])",
+        torch=lambda x, *_: x[:, begin:end],
         numbers=(("begin", begin), ("end", end)),
     )
 
@@ -135,6 +155,7 @@ def convolution(weight: Floats, bias: Floats, shape: tuple[int, int, int], side:
             pictures = Reshape(x, [-1,{channels},{rows},{columns}])
             filtered = Conv<strides = [{stride}, {stride}]>(pictures, w0, w1)
             y = Reshape(filtered, [-1,{outputs * high * wide}])""",
+        torch=lambda x, w, _: F.conv2d(x.unflatten(1, shape), w[0].T.reshape(filters), w[1], stride).flatten(1),
         arrays=(weight, bias),
         onnx_arrays=(weight.T.reshape(filters), bias),
         numbers=(("channels", channels), ("rows", rows), ("columns", columns), ("side", side), ("stride", stride)),
@@ -156,6 +177,7 @@ def global_max_pool(channels: int, places: int) -> Layer:
         onnx=f"""
             channels = Reshape(x, [-1,{channels},{places}])
             y = ReduceMax<axes = [2], keepdims = 0>(channels)""",
+        torch=lambda x, *_: x.unflatten(1, (channels, places)).amax(2),
         numbers=(("channels", channels), ("places", places)),
     )
 
@@ -167,7 +189,16 @@ def aggregate(begin: int, team: int, width: int, reach_squared: float) -> Layer:
     Neighbours have a squared distance below `reach_squared`. The means divide by their number plus one, for the agent
     itself.
     """
-    others, reach = team - 1, math.sqrt(reach_squared)
+    others, reach, index = team - 1, math.sqrt(reach_squared), others_of(team)
+
+    def hear(x: Tensor, _: Any, observation: Tensor) -> Tensor:
+        ways = observation[:, begin : begin + 2 * others].unflatten(1, (others, 2))
+        near = (ways.square().sum(2, keepdim=True) < reach_squared).float()
+        share = near / (1 + near.sum(1, keepdim=True))  # [rows, N - 1, 1]
+        own = torch.arange(x.shape[0])  # rows and not worlds: an archive with a number of worlds takes no single one
+        messages = x[(own - own % team).unsqueeze(1) + torch.tensor(index)[own % team]]
+        return torch.cat([x, (share * (ways / reach)).sum(1), (share * messages).sum(1)], 1)
+
     return Layer(
         "aggregate",
         # per other agent: distance (3), comparison, count, and two operations per number of position and features
@@ -187,11 +218,12 @@ def aggregate(begin: int, team: int, width: int, reach_squared: float) -> Layer:
             shared_ways = Mul(share, units)
             mean_way = ReduceSum<keepdims = 0>(shared_ways, [1])
             worlds = Reshape(x, [-1,{team},{width}])
-            gathered = Gather<axis = 1>(worlds, {json.dumps(others_of(team), separators=(",", ":"))})
+            gathered = Gather<axis = 1>(worlds, {json.dumps(index, separators=(",", ":"))})
             others = Reshape(gathered, [-1,{others},{width}])
             shared = Mul(share, others)
             message = ReduceSum<keepdims = 0>(shared, [1])
             y = Concat<axis = 1>(x, mean_way, message)""",
+        torch=hear,
         numbers=(("begin", begin), ("team", team), ("width", width), ("reach_squared", reach_squared)),
     )
 

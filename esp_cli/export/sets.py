@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import torch
+from torch import Tensor
+
 from esp_cli.export.layers import Floats, Layer
+from esp_cli.networks.set_features import distances_among, nearest_things
 
 
 @dataclass(frozen=True)
@@ -63,11 +67,34 @@ def pool_sets(
     widest = max(len(each.arrays[0]) for each in sets)
     structure = [(each.name, each.place, each.reader) for each in sets]
 
+    def pooled(x: Tensor, w: list[Tensor], tables: Mapping[str, Tensor]) -> Tensor:
+        weights, act = iter(w[len(own) :]), torch.relu if kind == "relu" else torch.tanh
+        seen = x[:, list(kept)]
+        seen = act(torch.addmm(w[1], seen, w[0])) if own else seen
+        things = []
+        for name, place, reader in structure:
+            table = tables[name].unsqueeze(0)
+            if near and place is not None:
+                ways = table[..., place : place + 2] - (0 if reader is None else x[:, None, reader : reader + 2])
+                table = nearest_things(table, ways, min(near, table.shape[2]))
+            things.append(table)
+        places = [t[..., p : p + 2] for t, (_, p, _) in zip(things, structure, strict=True) if p is not None]
+        far = iter(distances_among(places) if places else [])
+        parts = [seen]
+        for table, (_, place, _) in zip(things, structure, strict=True):
+            first, shared, bias, second, second_bias = (next(weights) for _ in range(5))
+            described = (table if place is None else torch.cat([table, next(far)], -1)).squeeze(0)
+            hidden = act(_each(described, first) + torch.addmm(bias, seen, shared).unsqueeze(1))
+            embedded = act(_each(hidden, second) + second_bias)
+            parts += [embedded.mean(1), embedded.amax(1)]
+        return torch.cat([*parts, x[:, inputs:]], 1)
+
     return Layer(
         "sets",
         flops=sum(2 * w.size for w in own) + of_things + sum(2 * each.arrays[1].size for each in sets),
         c=_c(sets, bool(own), kept, inputs, beside, near, kind),
         onnx=_onnx(sets, bool(own), kept, inputs, near, kind.capitalize()),
+        torch=pooled,
         arrays=(*own, *(array for each in sets for array in each.arrays)),
         numbers=(
             ("sets", structure),
@@ -80,6 +107,11 @@ def pool_sets(
         width=max(inputs + beside, outputs),
         scratch=len(kept) + 3 * features + widest + sum(near * each.width for each in sets if each.place is not None),
     )
+
+
+def _each(things: Tensor, weight: Tensor) -> Tensor:
+    """Return things [rows, K, W] times a weight, in a form that an archive takes for any K."""
+    return torch.bmm(things, weight.expand(things.shape[0], -1, -1))
 
 
 def _c(

@@ -73,7 +73,7 @@ def test_the_folder_that_comes_along_is_listed() -> None:
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (["-f", "tflite"], "there is no format 'tflite'; the formats are onnx, c, numpy, policy"),
+        (["-f", "tflite"], "there is no format 'tflite'; the formats are onnx, torch, c, numpy, policy"),
         (["-f", "policy", "-f", "c"], "-f policy bundles a policy; leave out the other formats"),
         (["-f", "c", "--name", "mine"], "--name is for -f policy alone"),
         (["-f", "c", "--seed", "4"], "has no seed 4; it has 3, 7"),
@@ -101,11 +101,11 @@ def test_what_is_there_is_kept_unless_forced(finished: Path, tmp_path: Path) -> 
 
 
 def test_no_file_of_another_policy_stays_beside_an_export(finished: Path, tmp_path: Path) -> None:
-    esp("export", finished, "-f", "numpy", "-f", "onnx", "-o", tmp_path, "--seed", 3)
+    esp("export", finished, "-f", "numpy", "-f", "torch", "-o", tmp_path, "--seed", 3)
     other = ("export", finished, "-f", "numpy", "-o", tmp_path, "--seed", 7, "--force")
-    assert "holds an export with other formats; write them anew too (-f onnx)" in refused(*other)
-    esp(*other, "-f", "onnx")
-    assert json.loads((tmp_path / "policy.json").read_text())["formats"] == ["numpy", "onnx"]
+    assert "holds an export with other formats; write them anew too (-f torch)" in refused(*other)
+    esp(*other, "-f", "torch")
+    assert json.loads((tmp_path / "policy.json").read_text())["formats"] == ["numpy", "torch"]
 
 
 def test_a_bundled_policy_is_replaced_only_by_force(finished: Path, tmp_path: Path) -> None:

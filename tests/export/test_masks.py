@@ -20,6 +20,7 @@ from esp_cli.export.export import export
 from esp_cli.export.numpy_policy import NumpyPolicy
 from esp_cli.export.onnx_file import onnx_model, onnx_runner
 from esp_cli.export.program import program_of
+from esp_cli.export.torch_file import TorchProgram
 from esp_envs import register
 from esp_envs.registry import TASKS
 from tests.export.policies import KINDS, drawn_policy
@@ -47,7 +48,7 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_exports_choose_among_allowed_actions_as_the_policy_does(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    results = export(drawn_policy(kind), ("numpy", "c", "onnx"), tmp_path).formats
+    results = export(drawn_policy(kind), ("numpy", "c", "onnx", "torch"), tmp_path).formats
     for result in results:
         assert result.agreement is not None
         assert result.agreement.observations == 10_000
@@ -68,6 +69,10 @@ def _run_calls(page: str, example: dict) -> None:
     for call in re.findall(r"`([^`]* = policy\.[^`]*)`", page):
         exec(call, scope)  # noqa: S102 - the export's own lines
     assert scope["action"].tolist() == [example["action"]]
+    (call,) = re.findall(r"`(torch\.export[^`]*)`", page)
+    given = {"torch": torch} | {name: torch.from_numpy(array) for name, array in rows.items()}
+    action = eval(call, given)[0]  # noqa: S307 - likewise
+    assert action.tolist() == [example["action"]]
     (told,) = re.findall(r"Inputs: (.*); outputs", page)
     read = {name: rows[name] for name in re.findall(r"`(\w+)`", told)}
     session = onnx_file.library("onnxruntime").InferenceSession("policy.onnx", providers=["CPUExecutionProvider"])
@@ -114,3 +119,5 @@ def test_agents_that_exchange_messages_choose_among_allowed_actions(tmp_path: Pa
     assert action.tolist() == expected.tolist()
     assert (action[0], action[1]) == (outputs[0].argmax(), 0)
     assert onnx_runner(tmp_path / "policy.onnx")(rows, memory, mask)[0].tolist() == expected.tolist()
+    through_torch = TorchProgram(program)(torch.from_numpy(rows), action_mask=torch.from_numpy(mask))[0]
+    assert through_torch.tolist() == expected.tolist()

@@ -15,15 +15,18 @@ from esp_cli.export.numpy_file import numpy_runner, numpy_source
 from esp_cli.export.onnx_file import onnx_model, onnx_runner
 from esp_cli.export.program import Program, program_of
 from esp_cli.export.sets import SetOf, pool_sets
+from esp_cli.export.torch_file import torch_archive, torch_runner
 from esp_envs.errors import UserError
 from tests.export.policies import drawn_policy
 
 
 def runners(program: Program, folder: Path) -> dict[str, Runner]:
     """Write a program in all formats and run it."""
+    (folder / "policy.pt2").write_bytes(torch_archive(program, "{}"))
     (folder / "policy.onnx").write_bytes(onnx_model(program, "{}"))
     (folder / "policy.py").write_bytes(numpy_source(program, "", {}))
-    made = {"onnx": onnx_runner(folder / "policy.onnx"), "numpy": numpy_runner(folder / "policy.py")}
+    made = {"torch": torch_runner(folder / "policy.pt2"), "onnx": onnx_runner(folder / "policy.onnx")}
+    made["numpy"] = numpy_runner(folder / "policy.py")
     if c_file.compiler() is not None:
         for name, source in c_source(program, "").items():
             (folder / name).write_bytes(source)

@@ -15,8 +15,9 @@ from esp_cli.export.c_file import c_runner, c_source
 from esp_cli.export.export import export
 from esp_cli.export.layers import activation, affine, aggregate, convolution, cut, global_max_pool
 from esp_cli.export.numpy_policy import NumpyPolicy
-from esp_cli.export.onnx_file import onnx_model, onnx_runner
+from esp_cli.export.onnx_file import onnx_runner
 from esp_cli.export.program import Program, program_of
+from esp_cli.export.torch_file import TorchProgram, torch_archive, torch_runner
 from esp_cli.policies.loaded import LoadedPolicy
 from tests.export.policies import drawn_policy
 
@@ -29,7 +30,7 @@ def numpy_policy(program: Program) -> NumpyPolicy:
     return NumpyPolicy(json.loads(json.dumps(program.describe())), program.weights)
 
 
-def test_a_picture_through_convolution_and_largest_response_by_hand(tmp_path: Path) -> None:
+def test_a_picture_through_convolution_and_largest_response_by_hand() -> None:
     # filter [[1, 2], [3, 4]] on channel 0 and its negative on channel 1, bias 0.5, every second place of 2 x 4 pixels
     weight = np.array([1, 2, 3, 4, -1, -2, -3, -4], np.float32)[:, None]
     filters = convolution(weight, np.array([0.5], np.float32), (2, 2, 4), side=2, stride=2)
@@ -39,37 +40,37 @@ def test_a_picture_through_convolution_and_largest_response_by_hand(tmp_path: Pa
     second = [[0, 0, 0, 0], [1, 0, 1, 0]]
     row = np.concatenate([[99], np.ravel(first), np.ravel(second)]).astype(np.float32)
     # left: 1 * 1 + 4 * 1 - 3 * 1 + 0.5, right: 2 * 1 - 3 * 1 + 0.5
-    for outputs in both(program, row[None], tmp_path):
+    for outputs in both(program, row[None]):
         assert outputs.tolist() == [[2.5, -0.5]]
     pooled = Program(17, (cut(1, 17), filters, global_max_pool(1, 2)), 1, 0, 0, "choose", ())
-    for outputs in both(pooled, row[None], tmp_path):
+    for outputs in both(pooled, row[None]):
         assert outputs.tolist() == [[2.5]]
     assert pooled.flops == 2 * 8 * 2 + 1 + 1
 
 
-def test_what_is_heard_by_hand(tmp_path: Path) -> None:
+def test_what_is_heard_by_hand() -> None:
     # own feature, then the ways to the two others; agents 0 and 1 are near each other, agent 2 is too far from both
     hear = aggregate(begin=1, team=3, width=1, reach_squared=4.0)
     program = Program(5, (cut(0, 1), hear), 4, 0, 0, "choose", (), team=3)
     rows = np.array([[10, 1, 1, 0, 2], [20, -1, -1, -1, 9], [40, 0, -2, 1, -9]], np.float32)
     # divided by two: the one heard and the agent itself; the way in reaches of 2; two cells are not less than two
     expected = [[10, 0.25, 0.25, 10], [20, -0.25, -0.25, 5], [40, 0, 0, 0]]
-    for outputs in both(program, rows, tmp_path):
+    for outputs in both(program, rows):
         assert np.allclose(outputs, expected)
     assert hear.flops == 2 * (9 + 2) + 4
 
 
-def test_a_model_takes_any_number_of_worlds_and_the_python_file_none_too(tmp_path: Path) -> None:
+def test_an_archive_and_the_python_file_take_one_world_and_no_world(tmp_path: Path) -> None:
     weight = np.arange(8, dtype=np.float32)[:, None]
     seen = (cut(1, 17), convolution(weight, np.ones(1, np.float32), (2, 2, 4), side=2, stride=2), global_max_pool(1, 2))
     program = Program(
         17, (*seen, aggregate(begin=1, team=3, width=1, reach_squared=4.0)), 4, 0, 0, "choose", (), team=3
     )
-    (tmp_path / "policy.onnx").write_bytes(onnx_model(program, "{}"))
-    model, written = onnx_runner(tmp_path / "policy.onnx"), numpy_policy(program)
+    (tmp_path / "policy.pt2").write_bytes(torch_archive(program, "{}"))
+    archive, written = torch_runner(tmp_path / "policy.pt2"), numpy_policy(program)
     for worlds in (1, 4):
         rows = np.random.default_rng(worlds).standard_normal((3 * worlds, 17)).astype(np.float32)
-        outputs = model(rows, np.zeros((3 * worlds, 0)))[1]
+        outputs = archive(rows, np.zeros((3 * worlds, 0)))[1]
         expected = written.outputs(rows.reshape(worlds, 3, 17), np.zeros((worlds, 3, 0)))[0]
         assert np.allclose(outputs, expected.reshape(-1, 4), atol=1e-5)
     assert written.act(np.zeros((0, 3, 17))).shape == (0, 3)
@@ -88,11 +89,11 @@ def test_what_is_not_a_number_stays_so_in_c(tmp_path: Path) -> None:
         assert np.array_equal(outputs, [[expected]], equal_nan=True)
 
 
-def both(program: Program, rows: np.ndarray, folder: Path) -> list[np.ndarray]:
-    """Return what the numpy and the ONNX export say to rows."""
-    (folder / "policy.onnx").write_bytes(onnx_model(program, "{}"))
-    nothing = np.zeros((len(rows), 0), np.float32)
-    return [numpy_policy(program).outputs(rows, nothing)[0], onnx_runner(folder / "policy.onnx")(rows, nothing)[1]]
+@torch.no_grad()
+def both(program: Program, rows: np.ndarray) -> list[np.ndarray]:
+    """Return what the numpy and the torch export say to rows."""
+    through_torch = TorchProgram(program)(torch.from_numpy(rows))[1].numpy()
+    return [numpy_policy(program).outputs(rows, np.zeros((len(rows), 0)))[0], through_torch]
 
 
 @pytest.mark.slow

@@ -1,0 +1,103 @@
+"""A program as a torch.export archive (.pt2): a graph of plain operations that torch or ExecuTorch runs."""
+
+from __future__ import annotations
+
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from esp_cli.export.check import Numbers, Runner
+from esp_cli.export.layers import Floats
+from esp_cli.export.program import SQUASH_EPSILON, Program
+from esp_cli.networks.heads import masked
+
+
+class TorchProgram(nn.Module):
+    """The program in torch's own operations.
+
+    Shape:
+        observation: [rows, D]; memory: [rows, H], for recurrent policies; action_mask: [rows, A] bool, for those with
+        masks; sets: tables [rows, K, W] by name, for networks over sets.
+        Returns action ([rows] int64 or [rows, width]), outputs [rows, outputs] and, if recurrent, memory [rows, H].
+        A team's rows stand side by side, world after world.
+    """
+
+    def __init__(self, program: Program) -> None:
+        super().__init__()
+        self.program = program
+        for k, layer in enumerate(program.layers):
+            for i, array in enumerate(layer.arrays):
+                self.register_buffer(f"w{k}_{i}", torch.from_numpy(array.copy()))
+
+    def forward(
+        self,
+        observation: Tensor,
+        memory: Tensor | None = None,
+        action_mask: Tensor | None = None,
+        sets: dict[str, Tensor] | None = None,
+    ) -> tuple[Tensor, ...]:
+        program, x = self.program, observation
+        hidden = x[:, :0] if memory is None else memory[:, : program.hidden]
+        if program.previous and memory is not None:
+            x = torch.cat([x, memory[:, program.hidden :]], 1)
+        for k, layer in enumerate(program.layers):
+            arrays = [self.get_buffer(f"w{k}_{i}") for i in range(len(layer.arrays))]
+            x = layer.torch(x, arrays, {"gru": hidden, "sets": sets}.get(layer.kind, observation))
+            hidden = x if layer.kind == "gru" else hidden
+        if program.head == "choose":
+            action = masked(x, action_mask).argmax(-1)
+            encoded = nn.functional.one_hot(action, program.num_outputs).float()
+        else:
+            action = encoded = _squash(x, program.groups)
+        if memory is None:
+            return action, x
+        return action, x, torch.cat([hidden, encoded], 1) if program.previous else hidden
+
+
+def _squash(x: Tensor, groups: tuple[int, ...]) -> Tensor:
+    """Bring each group of numbers into its bounds: u tanh|u| / |u|."""
+    parts = x.split(list(groups), -1)
+    lengths = [(part.square().sum(-1, keepdim=True) + SQUASH_EPSILON).sqrt() for part in parts]
+    return torch.cat([part * (torch.tanh(length) / length) for part, length in zip(parts, lengths, strict=True)], -1)
+
+
+def torch_archive(program: Program, description: str) -> bytes:
+    """Write a program as an archive of torch.export, for any number of rows, or of worlds for a team."""
+    worlds = torch.export.Dim("worlds", min=1)
+    rows = worlds if program.team == 1 else program.team * worlds
+    inputs = {"observation": torch.zeros(2 * program.team, program.num_inputs)}
+    if program.memory_width:
+        inputs["memory"] = torch.zeros(2 * program.team, program.memory_width)
+    arguments, named = tuple(inputs.values()), dict[str, Any]()
+    if program.masked:
+        named["action_mask"] = torch.ones(2 * program.team, program.num_outputs, dtype=torch.bool)
+    shapes: dict[str, Any] = {name: {0: rows} for name in inputs | named}
+    if program.sets:
+        widths = {name: len(columns[0]) for name, columns in program.sets}
+        named["sets"] = {name: torch.zeros(2, 3 + k, width) for k, (name, width) in enumerate(widths.items())}
+        shapes["sets"] = {name: {0: rows, 1: torch.export.Dim(f"things{k}")} for k, name in enumerate(widths)}
+    exported = torch.export.export(TorchProgram(program).eval(), arguments, named, dynamic_shapes=shapes)
+    content = BytesIO()
+    torch.export.save(exported, content, extra_files={"policy.json": description})
+    return content.getvalue()
+
+
+def torch_runner(file: Path) -> Runner:
+    """Run a written torch.export archive."""
+    module = torch.export.load(file).module()
+
+    def run(
+        obs: Floats, memory: Floats, mask: Numbers | None = None, sets: dict[str, Floats] | None = None
+    ) -> tuple[Numbers, Numbers, Numbers]:
+        allowed: dict[str, Any] = {} if mask is None else {"action_mask": torch.from_numpy(mask)}
+        if sets:
+            allowed["sets"] = {name: torch.from_numpy(table) for name, table in sets.items()}
+        inputs = [torch.from_numpy(array) for array in (obs, memory) if array.shape[1]]
+        with torch.no_grad():
+            results = [result.numpy() for result in module(*inputs, **allowed)]
+        return results[0], results[1], results[2] if len(results) > 2 else memory
+
+    return run
