@@ -42,7 +42,7 @@ class FormationSettings(TaskSettings):
     num_agents: int = Setting(8, ge=1, le=10_000, description="N, robots")
     num_obstacles: int = Setting(2, ge=0, le=10_000, description="M, pillars on a ring around the middle")
     obstacle_radius_m: float = Setting(0.05, gt=0, le=1, description="of a pillar, m")
-    arena_m: float = Setting(2.0, gt=0, le=1000, description="length of a wall, m")
+    arena_m: float = Setting(2.0, gt=0, le=20, description="length of a wall, m")
     density: float | None = Setting(
         None, gt=0, description="robots per metre of wall, however many there are; by default walls have arena_m"
     )
