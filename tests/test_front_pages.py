@@ -103,3 +103,63 @@ def test_each_part_of_the_prior_is_ahead_in_the_first_study() -> None:
         "augmentation": "ahead",
         "both": "ahead",
     }
+
+
+EXPORT, LIBRARY, READING = "docs/export.md", "docs/library.md", 200
+QUESTIONS = [
+    # a researcher of multi-agent learning
+    ("What does the prior gain?", (), "85.9 with symmetry and 14.0 without"),
+    ("Which task is simple_spread?", (), "`simple_spread` is `navigation` here"),
+    ("Which return is good?", ("docs/measurements/index.md", "#how-to-read-the-numbers"), "0 is the random policy"),
+    ("Is it ahead of BenchMARL?", ("docs/measurements/peers.md",), "BenchMARL's -22.1 ± 1.0"),
+    ("How does a run reach wandb?", ("docs/index.md", "configuration.md#trackers"), "`WANDB_MODE=online`"),
+    # a roboticist
+    ("Has a real robot driven?", (EXPORT, "#on-robots"), "Untested on hardware"),
+    ("Has my robot a mirror?", ("docs/legged-robots.md",), "esp mirror robot.xml"),
+    ("Does a policy fit a microcontroller?", (EXPORT, "#on-a-microcontroller"), "about 1 kB beside the weights"),
+    ("What if the tracker fails?", (EXPORT, "#from-poses-to-wheel-speeds"), "poses are older than 0.5 s"),
+    ("How do I declare a lidar?", (LIBRARY,), "a lidar `Kind.RING`"),
+    # the owner of a task or of a loop
+    ("How do I bring a PettingZoo task?", ("docs/adapters.md",), "class Spread(ParallelTask)"),
+    ("Is what I declared true?", (LIBRARY, "#check-what-you-said"), "shows in transitions"),
+    ("What may my policy return?", (LIBRARY, "#add-consistency-to-a-loss"), "`OneHotCategorical`, or logits"),
+    ("How do I use it in TorchRL?", (LIBRARY, "#torchrl"), "`SymmetricLoss` goes around"),
+    ("What about a replay?", (LIBRARY, "#a-replay"), "the next observation and the reward by the same element"),
+]
+
+
+def read_first(page: Path, anchor: str) -> str:
+    """Return the first words that a reader reads of a page, from the heading of an anchor on."""
+    text = page.read_text(encoding="utf-8")
+    for heading in re.finditer(r"^#+ (.+)$", text, re.MULTILINE) if anchor else ():
+        if re.sub(r"[^\w\- ]", "", heading[1].lower()).replace(" ", "-") == anchor:
+            text = text[heading.start() :]
+            break
+    words = list(re.finditer(r"\S*\w\S*", text))[:READING]
+    return " ".join(text[: words[-1].end()].split())
+
+
+def reached(links: tuple[str, ...]) -> str:
+    """Follow links from the README on, each among what is read of the page before; return what is read of the last."""
+    page, text = ROOT / "README.md", " ".join(README.split())
+    for link in links:
+        assert f"]({link})" in text, f"no link to {link} at the beginning of {page}"
+        path, _, anchor = link.partition("#")
+        page = page.parent / path if path else page
+        text = read_first(page, anchor)
+    return text
+
+
+@pytest.mark.parametrize(("question", "links", "answer"), QUESTIONS, ids=[one[0] for one in QUESTIONS])
+def test_a_question_is_answered_within_two_links_and_200_words(
+    question: str, links: tuple[str, ...], answer: str
+) -> None:
+    assert len(links) <= 2
+    assert answer in reached(links)
+
+
+def test_a_lost_link_and_an_answer_far_down_a_page_are_found() -> None:
+    with pytest.raises(AssertionError, match=r"no link to gone\.md"):
+        reached((LIBRARY, "gone.md"))
+    assert "SymmetricLoss" in (ROOT / LIBRARY).read_text(encoding="utf-8")
+    assert "SymmetricLoss" not in reached((LIBRARY,))

@@ -18,9 +18,9 @@ from esp_envs.spec import Discrete, Spaces
 _TRIED = ("d8", "d12", "rot57", "flip23")
 """Turns and mirrors that are tried; the last two stand for all angles. Of n moves d-n is tried, too."""
 _EXCHANGES = 28
-"""Exchanges of any two that are tried, at most, as of 8 agents; of more things those of neighbours are."""
+"""Up to so many exchanges (those of 8 agents) all pairs are tried; of more things, only neighbours."""
 _MOST = 64
-"""Of more listed elements some are tried that generate them all: where these hold, so do their products."""
+"""Of longer lists only generators are tried: where these hold, so do their products."""
 
 
 def candidates(spaces: Spaces, transforms: str | None = None) -> list[Element]:

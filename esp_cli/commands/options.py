@@ -164,7 +164,8 @@ OwnNetworkOption = Annotated[
 PresetOption = Annotated[
     str,
     typer.Option(
-        "--preset", help="'default' (measured best), 'fast' (in seconds, not steps) or 'paper' (the paper's settings)."
+        "--preset",
+        help="'default' (measured best), 'fast' (fewer seconds, more steps) or 'paper' (the paper's settings).",
     ),
 ]
 StepsOption = Annotated[
@@ -204,7 +205,7 @@ else:  # typer trusts the parser for a plain `tuple`, but would read tuple[int, 
 OutOption = Annotated[Path, typer.Option("--out", "-o", help="Path of the output.")]
 Device = Literal["auto", "cpu", "cuda"]
 NoCheckOption = Annotated[
-    bool, typer.Option("--no-check", help="Leave out the short look, of 2 s, at a task that is not built in.")
+    bool, typer.Option("--no-check", help="Skip the check, of at most 2 s, of a task that is not built in.")
 ]
 DeviceOption = Annotated[Device, typer.Option("--device", help="cpu, cuda, or auto: a GPU if there is one.")]
 JsonOption = Annotated[

@@ -68,7 +68,7 @@ def train(
         Path | None,
         typer.Option(
             "--config",
-            help="Take what no option says from a run, its config.json, or a JSON or TOML file with what differs.",
+            help="Read settings from a run, its config.json, or a JSON or TOML file; options override them.",
         ),
     ] = None,
     print_config: Annotated[
@@ -86,12 +86,14 @@ def train(
         list[str] | None,
         typer.Option(
             "--track",
-            help="Give the metrics to tensorboard, wandb or mlflow too; repeatable. Offline, in the run folder.",
+            help="Also send metrics to tensorboard, wandb or mlflow, offline in the run folder; repeatable.",
         ),
     ] = None,
     watch: Annotated[
         bool,
-        typer.Option("--watch", help="Draw curve and present policy into a page of the run folder, for a browser."),
+        typer.Option(
+            "--watch", help="Draw the curve and the current policy on a page in the run folder, for a browser."
+        ),
     ] = False,
     no_check: options.NoCheckOption = False,
 ) -> None:

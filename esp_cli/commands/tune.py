@@ -57,7 +57,7 @@ def tune(
     reach: Annotated[float | None, typer.Option("--reach", help="The return to come to.", metavar="RETURN")] = None,
     trial_seeds: Annotated[int, typer.Option("--trial-seeds", min=1, max=100, help="Seeds of each trial.")] = 3,
 ) -> None:
-    """Search for better settings; judge the best on fresh seeds. Called again, it goes on where it was."""
+    """Search for better settings; evaluate the best on fresh seeds. Called again, it goes on where it was."""
     priors = parse_names(prior) or ("esp",)
     check_finite("--reach", *(() if reach is None else (reach,)))
     request = choices.request("tune")
