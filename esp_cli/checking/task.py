@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from esp_cli.checking import paired, transitions
 from esp_cli.checking.candidates import candidates, refused
@@ -20,6 +20,7 @@ from esp_envs.base import Environment
 from esp_envs.errors import UserError
 from esp_envs.promises import MakeWorlds
 from esp_envs.spec import Spaces
+from esp_envs.views import RoleView
 
 PAIRED, TRANSITIONS = "paired states", "transitions"
 TOLERATED = {PAIRED: paired.TOLERATED, TRANSITIONS: transitions.TOLERATED}
@@ -28,6 +29,7 @@ _COPIES, _FOREIGN = 256, 64
 """Worlds of a task that cannot be set to a state, and of a simulator of others that can, at most."""
 _EPISODES = 4096
 _UNTRIED = "shifts are tried where a task can be set to a state"
+_SEVERAL = "no state holds these items, and each agent's transitions do not show what others see beside them"
 
 
 @dataclass(frozen=True)
@@ -148,8 +150,19 @@ def judged(
     found = paired.check_paired(settable, carried, None if native else _FOREIGN, watch, until, spare)
     verdicts = dict(zip(carried, found, strict=True))
     if rest := [element for element in elements if element not in verdicts]:  # items that the simulator does not name
-        verdicts |= dict(zip(rest, judged(make, rest, True, watch, min(until, spare))[1], strict=True))
+        by_rows = judged(make, rest, True, watch, min(until, spare))[1]
+        verdicts |= zip(rest, by_rows if _everybody(probe) == 1 else map(_unseen, by_rows), strict=True)
     return PAIRED, [verdicts[element] for element in elements]
+
+
+def _everybody(env: Environment) -> int:
+    """Return how many agents there are, of all roles."""
+    return env.inner.spec.num_agents if isinstance(env, RoleView) else env.spec.num_agents
+
+
+def _unseen(verdict: ElementVerdict) -> ElementVerdict:
+    """Return a verdict by each agent's own transitions, where what others see may say what a colour or word means."""
+    return replace(verdict, fields=(), reason=_SEVERAL) if verdict.outcome == "holds" else verdict
 
 
 def _is_carried(element: Element | Shift, spaces: Spaces) -> bool:

@@ -179,3 +179,51 @@ def test_half_of_the_worlds_follows_the_heuristic(monkeypatch: pytest.MonkeyPatc
     assert all(torch.equal(wise[:, :2], action[:, :2]) for wise, action in steps)
     assert torch.equal(steps[0][1][:, 2:], drawn[:, 2:])
     assert not torch.equal(steps[0][1], drawn), "the control"
+
+
+class Told(BatchedTask):
+    """The first of some agents sees which of two colours an episode draws; the last one's place pays accordingly."""
+
+    agents = 2
+
+    def _describe(self):
+        place = layout(Field("place", Kind.SCALAR))
+        return TaskSpec(
+            name="told", version=1, convention="", num_agents=self.agents, horizon=8, symmetry="c1", shared_reward=True,
+            observation=layout(*place.fields, Field("colour", Kind.SCALAR, 2)), action=STEPS,
+            state=layout(Field("place", Kind.SCALAR, self.agents)),
+        )  # fmt: skip
+
+    def _start(self, generator):
+        self.colour = torch.nn.functional.one_hot(torch.randint(2, (1, self.num_envs), generator=generator), 2).float()
+        return {"place": self.draw(self.agents, 1, generator=generator)}
+
+    def _advance(self, world, action):
+        world["place"] = self.draw(self.agents, 1)
+        return self.paid(world["place"][..., -1, 0]), {}
+
+    def paid(self, place):
+        return place * (self.colour[..., 0] - self.colour[..., 1])
+
+    def _observe(self, world):
+        seen = torch.zeros(*world["place"].shape[:3], 2)
+        seen[..., 0, :] = self.colour
+        return torch.cat([world["place"], seen], -1)
+
+
+class Alone(Told):
+    """One agent sees the colour, and both colours pay alike."""
+
+    agents = 1
+
+    def paid(self, place):
+        return place
+
+
+@pytest.mark.parametrize(("cls", "outcome"), [(Told, "not covered"), (Alone, "holds")])
+def test_what_no_state_holds_is_judged_by_rows_only_where_nobody_else_is_there(cls, outcome: str) -> None:
+    """Told's colours change round only together with the sign of another agent's place, which the first never sees."""
+    register(cls)
+    make_it = lambda num_envs, seeds: cls(cls.Settings(), num_envs, generators_for(seeds))  # noqa: E731
+    (found,) = check_symmetry(make_it, "colour-1-0").elements
+    assert (found.outcome, bool(found.reason)) == (outcome, outcome == "not covered")
