@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 import subprocess
 from html.parser import HTMLParser
 from pathlib import Path
@@ -16,10 +15,9 @@ from esp_cli.drawing.films import write_gif
 from esp_cli.reporting.collect import Material, collect_study
 from esp_cli.reporting.page import write_report
 from esp_cli.reporting.tables import Table, markdown_text
+from tests.site.browser import BROWSER, DESKTOP, PHONE, complaints
 from tests.studies.small_studies import small_study, write_study
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-BROWSER = next((path for name in BROWSERS if (path := shutil.which(name))), None)
 needs_browser = pytest.mark.skipif(BROWSER is None, reason="no Chromium here: .ci/install-chromium, or apt-get")
 HOSTILE = "</script><script>console.error('run')</script>&\"'"
 HOVER = """
@@ -93,7 +91,7 @@ def test_every_section_has_a_link_that_leads_to_it(page):
     text = page.read_text()
     places = re.findall(r'<h2 id="([^"]+)">', text)
     assert text.count("<h2") == len(places) == len(set(places))
-    assert {"table-1", "curves", "films", "runs"} <= set(places)
+    assert {"table-1", "films", "runs"} <= set(places)
     assert "figures" not in places, "this study has none"
     for place in places:
         assert text.count(f'href="#{place}"') == 2, "in the list of sections, and beside the heading"
@@ -205,3 +203,14 @@ def test_a_screenshot_has_the_colours_of_the_curves(page, tmp_path):
     with Image.open(picture) as image:
         colours = {colour for _, colour in image.convert("RGB").getcolors(2**24)}
     assert {(0x00, 0x72, 0xB2), (0xE6, 0x9F, 0x00)} <= colours
+
+
+@needs_browser
+@pytest.mark.parametrize("width", [DESKTOP, PHONE])
+def test_nothing_is_scrolled_sideways(page: Path, width: int, tmp_path: Path) -> None:
+    assert complaints([page], width, tmp_path) == []
+    cards, rows = "thead { display: none; }", "<style>thead { display: table-header-group !important; } "
+    wide = tmp_path / "wide.html"
+    wide.write_text(page.read_text().replace(cards, "").replace("<style>", f"{rows}td {{ min-width: 900px; }} "))
+    (tmp_path / "again").mkdir()
+    assert "sideways" in "".join(complaints([wide], width, tmp_path / "again"))

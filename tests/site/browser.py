@@ -26,6 +26,8 @@ window.onload = () => {{
     const say = text => found.push(frame.title + ": " + text);
     if (!page.querySelector("h1")) say("has no heading");
     if (root.scrollWidth > root.clientWidth) say("is " + (root.scrollWidth - root.clientWidth) + " px too wide");
+    for (const box of page.querySelectorAll(".wide"))
+      if (box.scrollWidth > box.clientWidth + 1) say("scrolls " + box.innerText.slice(0, 40) + " sideways");
     for (const picture of page.images) if (!picture.naturalWidth) say("does not show " + picture.getAttribute("src"));
     for (const code of page.querySelectorAll("article pre > code"))
       if (code.scrollWidth > code.clientWidth + 1) say("cuts a line of " + code.innerText.slice(0, 60));
