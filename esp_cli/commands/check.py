@@ -46,8 +46,8 @@ def check(
 ) -> None:
     """Check what every task promises, or a task's declared symmetry.
 
-    Symmetry is judged per element and field: it holds, it is broken, or it is not covered, where nothing could have
-    shown a breaking. Exit code 0: all that is declared holds; 1: something is broken; 2: something declared is not
+    Symmetry is tested per element and field: it holds, is broken, or is not covered (no data could have shown a
+    breaking). Exit code 0: all that is declared holds; 1: something is broken; 2: something declared is not
     covered.
     """
     from esp_cli.training.config import resolve_task_settings

@@ -46,8 +46,8 @@ def discover(
 ) -> None:
     """Find symmetries that nobody declared, and print the --transforms that use them.
 
-    An element is accepted where a breaking of a tolerance's size would have been seen: of elements that are off by that
-    or more, one of a hundred is accepted. What the data could not have shown is "not covered".
+    An element is accepted only if the data would have shown a breaking of the tolerance's size. Of elements that are
+    off by as much or more, one in a hundred is accepted. Where the data could not show it, an element is "not covered".
     """
     found = _discovery(what, task, transforms, parse_task_settings(settings or []), logs, seconds)
     tried = [

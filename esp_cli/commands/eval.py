@@ -33,7 +33,7 @@ def evaluate(
             "-e",
             min=1,
             max=1_000_000,
-            help="Episodes per seed and policy; fewer unless given where they are long or of many agents.",
+            help="Episodes per seed and policy; by default fewer if they are long or have many agents.",
             show_default=str(EPISODES),
         ),
     ] = None,

@@ -60,8 +60,8 @@ def export(
 ) -> None:
     """Write a policy for other programs (ONNX, torch.export, C99, numpy), checked against the policy itself.
 
-    Every export brings the layout and the units of its observation, the meaning of its actions, and a worked example.
-    Of a task whose agents have roles each role's policy gets a folder.
+    Every export has the layout and the units of its observation, the meaning of its actions, and a worked example.
+    If the agents of a task have roles, each role's policy gets a folder.
     """
     _check_options(formats, seed, episodes, name)
     from esp_cli.export.export import export as write

@@ -150,16 +150,16 @@ def not_over_a_run(context: typer.Context, path: T) -> T:
 TaskOption = Annotated[str, typer.Option("--task", "-t", help="Task: one that `esp tasks` lists, or module:Class.")]
 _OWN: dict[str, Any] = {"parser": _own_class, "metavar": "MODULE:CLASS"}
 OwnTaskOption = Annotated[
-    list[str] | None, typer.Option("--task", help="Import this task of yours, which the run or policy is of.", **_OWN)
+    list[str] | None, typer.Option("--task", help="Import your task, on which the run or policy was trained.", **_OWN)
 ]
 AlgoOption = Annotated[
     str, typer.Option("--algo", "-a", help="Learning algorithm: mappo, maddpg, qmix, or module:Class.")
 ]
 OwnAlgoOption = Annotated[
-    list[str] | None, typer.Option("--algo", help="Import this algorithm of yours, which trained the run.", **_OWN)
+    list[str] | None, typer.Option("--algo", help="Import your algorithm, which trained the run.", **_OWN)
 ]
 OwnNetworkOption = Annotated[
-    list[str] | None, typer.Option("--network", help="Import this network of yours, which the run has.", **_OWN)
+    list[str] | None, typer.Option("--network", help="Import your network, which the run uses.", **_OWN)
 ]
 PresetOption = Annotated[
     str,

@@ -58,7 +58,7 @@ def render(
         ),
     ] = 480,
     speed: Annotated[
-        float, typer.Option("--speed", parser=parse_speed, metavar="TIMES", help="Times real time, as 0.5 or 4x.")
+        float, typer.Option("--speed", parser=parse_speed, metavar="TIMES", help="Multiple of real time, as 0.5 or 4x.")
     ] = 1.0,
     fps: Annotated[
         float | None,
@@ -79,7 +79,7 @@ def render(
 ) -> None:
     """Play episodes and draw them off-screen: a film (.gif, .mp4), or a picture (.png, .pdf, .svg) of one episode.
 
-    The picture shows paths, below them who covers which landmark or catches the prey when; of wildlife the last steps.
+    A picture shows paths, and when each agent covers a landmark or catches the prey. Wildlife's shows the last steps.
     """
     from esp_cli.drawing.draw import Request, draw
     from esp_cli.policies.loading import open_policy

@@ -105,7 +105,7 @@ class StudyChoices:
         str | None,
         typer.Option(
             "--address",
-            help="Of the Ray cluster, as auto or HOST:6379; by default RAY_ADDRESS, or else a cluster of this machine.",
+            help="Ray cluster, as auto or HOST:6379; by default RAY_ADDRESS, or else a new one on this machine.",
         ),
     ] = None
     gpu_share: Annotated[

@@ -54,7 +54,7 @@ def tune(
         Literal["return", "steps", "seconds"],
         typer.Option("--for", help="The highest return at the end, or fewest steps or seconds to the return --reach."),
     ] = "return",
-    reach: Annotated[float | None, typer.Option("--reach", help="The return to come to.", metavar="RETURN")] = None,
+    reach: Annotated[float | None, typer.Option("--reach", help="The return to reach.", metavar="RETURN")] = None,
     trial_seeds: Annotated[int, typer.Option("--trial-seeds", min=1, max=100, help="Seeds of each trial.")] = 3,
 ) -> None:
     """Search for better settings; evaluate the best on fresh seeds. Called again, it goes on where it was."""

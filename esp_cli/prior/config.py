@@ -61,7 +61,7 @@ class PriorConfig(Strict):
 
     trust: Literal["full", "measured", "gate"] = Field(
         "full",
-        description="weight of a copy: 1, or by how far its element is broken; gate: of earlier runs, trained no more",
+        description="weight of a copy: 1, or by how far its element is broken; gate: in runs of earlier versions only",
     )
     doubt: float = Field(8.0, ge=0, le=1000, description="what is off by b s.d. weighs exp(-doubt b)")
     weights: dict[str, Annotated[float, Field(ge=0, le=1)]] = Field(

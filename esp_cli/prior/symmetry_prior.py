@@ -41,7 +41,7 @@ class SymmetryPrior:
     ) -> None:
         self.config = config
         if config.trust == "gate":
-            raise UserError("prior.trust=gate is trained no more; choose measured, or evaluate what it trained")
+            raise UserError("prior.trust=gate can no longer be trained; choose measured, or evaluate a run that has it")
         self._stores = config.augments and replays and config.replay == "stored"
         self.augments = config.augments and not self._stores
         active = config.augments or config.coefficient > 0

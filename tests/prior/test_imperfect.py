@@ -304,7 +304,7 @@ def test_a_gate_of_an_earlier_version_is_read_and_trains_no_more(tmp_path: Path)
     told = json.loads((tmp_path / "run" / "config.json").read_text())
     told["prior"] |= {"trust": "gate", "weights": {"rot90": 0.5}}
     RunFolder.create(tmp_path / "old", {name: told[name] for name in RunConfig.model_fields})
-    assert "prior.trust=gate is trained no more" in refused("train", "--resume", tmp_path / "old")
+    assert "prior.trust=gate can no longer be trained" in refused("train", "--resume", tmp_path / "old")
     shutil.copy(tmp_path / "run" / "policy.safetensors", tmp_path / "old")
     assert Run(tmp_path / "old").config.prior.trust == "gate"
     assert Run(tmp_path / "old").evaluate(2).episodes == 2

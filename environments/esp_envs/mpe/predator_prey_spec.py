@@ -89,7 +89,7 @@ def predator_prey_spec(settings: PredatorPreySettings) -> TaskSpec:
     order = "velocity first" if settings.convention == "esp" else "position first"
     rewards = {"predators": "10 a touch to each predator", "prey": "-10 a touch, bounds"}
     reward = rewards.get(control, ", ".join(f"{who} {what}" for who, what in rewards.items()))
-    opponent = {"prey": "greedy predators", "both": "both learn"}.get(control, f"{settings.prey} prey")
+    opponent = {"prey": "chasing predators", "both": "both learn"}.get(control, f"{settings.prey} prey")
     whole = "d4*agents" if discrete or prey_learns else "o2*agents"
     learned = [Breaks("c1", agents=False)] if settings.prey == "policy" else []
     sides = {"predators": (settings.num_predators, _predator_layout(settings)), "prey": (1, prey_layout(settings))}
