@@ -68,11 +68,13 @@ def _default(trained: TrainedPolicy) -> int:
 
 
 def _print(result: FinalEvaluation, policy: str) -> None:
-    rows, by_hand = [], [value for key, value in result.anchors.items() if key != "random"]
-    low, high = result.anchors.get("random", math.nan), max(by_hand, default=math.nan)
+    from esp_cli.policies.statistics import normalised
+
+    rows = []
 
     def score(value: float | None) -> str:
-        return f"{(value - low) / (high - low):.2f}" if value is not None and high > low else "-"
+        scaled = None if value is None else normalised(value, result.anchors)
+        return "-" if scaled is None else f"{scaled:.2f}"
 
     for mode in ("greedy", "stochastic"):
         returns = result.returns(mode)

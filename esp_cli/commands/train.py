@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -157,6 +157,8 @@ def _refuse_beside_resume(context: typer.Context, allowed: Sequence[str]) -> Non
 
 
 def _train(run: Run, trackers: Sequence[str], watch: bool, check: bool) -> None:
+    from esp_cli.policies.evaluation import rough_anchors
+
     with run.trainer(trackers, check) as trainer, stop_requests("stopping after this iteration") as requests:
         if trainer.is_complete and run.is_complete:
             console.note(f"{run.path} is complete at {console.format_count(trainer.step)} steps")
@@ -164,12 +166,13 @@ def _train(run: Run, trackers: Sequence[str], watch: bool, check: bool) -> None:
         config = run.config
         _announce(config, run.path, trainer.step)
         page = _watched(trainer) if watch else None
+        anchors = rough_anchors(config, 2 * config.evaluation.episodes)
         with console.TrainingProgress(config.steps, len(config.seeds), trainer.step, config.task) as progress:
 
             def listen(news: Progress) -> bool:
                 for text in news.notes:
                     console.note(text)
-                progress.update(min(news.step, news.total), _shown(news))
+                progress.update(min(news.step, news.total), _shown(news, anchors))
                 if page is not None:
                     page.write(news.step, news.metrics)
                 return not requests
@@ -183,7 +186,7 @@ def _train(run: Run, trackers: Sequence[str], watch: bool, check: bool) -> None:
             f"{shlex.join(['esp', 'train', '--resume', str(run.path), *config.own_words()])}"
         )
         raise typer.Exit(130)
-    _report(trainer, run.path, config)
+    _report(trainer, run.path, config, anchors)
 
 
 def _watched(trainer: Trainer) -> Guarded:
@@ -225,27 +228,37 @@ def _announce(config: RunConfig, path: Path, step: int) -> None:
     )
 
 
-def _shown(news: Progress) -> dict[str, float]:
+def _shown(news: Progress, anchors: Mapping[str, float]) -> dict[str, float]:
+    from esp_cli.policies.statistics import normalised
+
     names = {"greedy": "eval/return_greedy", "return": "train/return", "entropy": "train/entropy"}
     out = {}
     for label, name in names.items():
         values = [x for x in news.metrics.get(name, []) if x is not None and not math.isnan(x)]
         if values:
             out[label] = sum(values) / len(values)
+        if label == "greedy" and values and (scaled := normalised(out[label], anchors)) is not None:
+            out["normalised"] = float(scaled)
     return out
 
 
-def _report(trainer: Trainer, path: Path, config: RunConfig) -> None:
+def _report(trainer: Trainer, path: Path, config: RunConfig, anchors: Mapping[str, float]) -> None:
     import numpy as np
 
-    from esp_cli.policies.statistics import mean_and_sem
+    from esp_cli.policies.statistics import mean_and_sem, normalised
 
-    rows = []
+    rows: list[tuple[object, ...]] = []
+    columns: tuple[str, ...] = ("policy", "episode return>", "seeds>")
     for mode, values in trainer.final_returns().items():
         good = values[np.isfinite(values)]  # a seed that stopped has none
-        rows.append((mode, console.format_mean(*mean_and_sem(good)), len(good)))
+        mean, sem = mean_and_sem(good)
+        scaled = normalised(mean, anchors) if good.size else None
+        rows.append((mode, console.format_mean(mean, sem), len(good), "-" if scaled is None else f"{scaled:.2f}"))
     caption = f"convention {trainer.learner.spec.convention}; mean ± s.e.m. over seeds, last evaluation"
-    console.table(("policy", "episode return>", "seeds>"), rows, caption=caption)
+    if anchors:
+        columns += ("normalised>",)
+        caption += "; normalised: 0 random, 1 the best heuristic, both over few episodes"
+    console.table(columns, [row[: len(columns)] for row in rows], caption=caption)
     if not trainer.learner.has_learned:
         console.note(
             "nothing was learned: the run ended within its warm-up; take more --steps or fewer warmup_episodes"

@@ -14,7 +14,7 @@ from esp_cli.files.opening import taking_turns
 from esp_cli.policies.bundled import NAME_PATTERN, Entry, Score, read_bundled, standard_name, write_bundled
 from esp_cli.policies.evaluation import play_batches, play_references
 from esp_cli.policies.loading import TrainedPolicy
-from esp_cli.policies.statistics import spread_over_episodes
+from esp_cli.policies.statistics import normalised, spread_over_episodes
 from esp_cli.training.build import Episodes, PolicyController, build_environment
 from esp_cli.training.checkpoint import describe_policy, write_policy
 from esp_cli.training.folder_names import CONFIG
@@ -43,10 +43,9 @@ def score_of(episodes: Episodes) -> Score:
 def normalised_of(own: TrainedPolicy, score: Score) -> float | None:
     """Return a score between those of the random policy, 0, and of the best heuristic, 1, on as many episodes."""
     names = build_environment(own.config, 1, "shape").heuristics
-    played = play_references(own, names, score.episodes)
-    low, *by_hand = (float(episodes.returns.mean()) for episodes in played.values())
-    best = max(by_hand, default=low)
-    return (score.mean - low) / (best - low) if best > low else None
+    played = play_references(own.config, names, score.episodes)
+    scaled = normalised(score.mean, {name: float(episodes.returns.mean()) for name, episodes in played.items()})
+    return None if scaled is None else float(scaled)
 
 
 def play_greedily(trained: TrainedPolicy, episodes: int) -> Episodes:

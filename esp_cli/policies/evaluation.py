@@ -24,9 +24,13 @@ from esp_cli.training.build import (
     generators,
     play,
 )
+from esp_cli.training.config import RunConfig
 from esp_envs.errors import UserError
+from esp_envs.registry import TASKS
 
 MAX_WORLDS = 4096  # played at once, over all seeds; more episodes are played one batch after the other
+_ROUGH_AGENT_STEPS, _ROUGH_ERROR = 5000, 0.1
+"""Of each reference policy where a second has to do, and the largest standard error, as a share of their scale."""
 _STREAM = "judgement"  # names the worlds; the word decides the numbers of every final evaluation, so it stays
 Metrics = dict[str, float | None]
 
@@ -75,7 +79,7 @@ def evaluate(trained: TrainedPolicy, episodes: int) -> FinalEvaluation:
         for numbers in (played.returns, *played.metrics.values()):
             numbers[list(trained.stopped)] = float("nan")
     one_world = build_environment(trained.config, 1, _STREAM, "shape")
-    names, anchors = one_world.heuristics, play_references(trained, one_world.heuristics, episodes)
+    names, anchors = one_world.heuristics, play_references(trained.config, one_world.heuristics, episodes)
     spread = dict(anchors)
     if len(seeds) == 1 and not trained.stopped:
         spread |= {"greedy": greedy, "stochastic": stochastic}
@@ -102,12 +106,30 @@ def evaluate(trained: TrainedPolicy, episodes: int) -> FinalEvaluation:
     )
 
 
-def play_references(trained: TrainedPolicy, names: Sequence[str], episodes: int) -> dict[str, Episodes]:
+def play_references(config: RunConfig, names: Sequence[str], episodes: int) -> dict[str, Episodes]:
     """Play the random policy and the task's heuristics: "random", "heuristic" for the first, others by name."""
-    anchors = {"random": play_batches(trained, ScriptedController(methodcaller("random_action")), "random", episodes)}
+    anchors = {"random": _play(config, ScriptedController(methodcaller("random_action")), "random", episodes)}
     for key, name in zip(("heuristic", *names[1:]), names, strict=False):
-        anchors[key] = play_batches(trained, ScriptedController(methodcaller("heuristic", name)), "heuristic", episodes)
+        anchors[key] = _play(config, ScriptedController(methodcaller("heuristic", name)), "heuristic", episodes)
     return anchors
+
+
+def rough_anchors(config: RunConfig, episodes: int) -> dict[str, float]:
+    """Return mean returns of the reference policies over few episodes of one seed, for about a second.
+
+    Nothing is returned of a task that is not built in, nor where so few episodes say too little.
+    """
+    if not TASKS.ships(config.task):
+        return {}
+    config = config.model_copy(update={"seeds": config.seeds[:1], "device": "cpu"})
+    world = build_environment(config, 1, _STREAM, "shape")
+    episodes = min(episodes, _ROUGH_AGENT_STEPS // (world.spec.horizon * world.spec.num_agents))
+    if world.spec.roles or not world.heuristics or episodes < 2:
+        return {}
+    played = {name: one.returns[0] for name, one in play_references(config, world.heuristics, episodes).items()}
+    anchors = {name: float(returns.mean()) for name, returns in played.items()}
+    error = max(float(returns.std()) for returns in played.values()) / episodes**0.5
+    return anchors if error < _ROUGH_ERROR * (max(anchors.values()) - anchors["random"]) else {}
 
 
 @torch.no_grad()
@@ -139,10 +161,14 @@ def _means(episodes: Episodes) -> Metrics:
 
 def play_batches(trained: TrainedPolicy, controller: Controller, stream: str, episodes: int) -> Episodes:
     """Play episodes (so many per seed) in batches whose worlds depend on the seeds, the stream and the batch alone."""
+    return _play(trained.config, controller, stream, episodes)
+
+
+def _play(config: RunConfig, controller: Controller, stream: str, episodes: int) -> Episodes:
     parts = []
-    batch = max(1, min(episodes, MAX_WORLDS // len(trained.config.seeds)))
+    batch = max(1, min(episodes, MAX_WORLDS // len(config.seeds)))
     for begin in range(0, episodes, batch):
-        env = build_environment(trained.config, min(batch, episodes - begin), _STREAM, stream, begin)
+        env = build_environment(config, min(batch, episodes - begin), _STREAM, stream, begin)
         parts.append(play(env, controller))
     return Episodes(
         torch.cat([p.returns for p in parts], 1),

@@ -163,6 +163,12 @@ def normalise(values: ArrayLike, random: float, heuristic: float) -> Floats:
     return (np.asarray(values, dtype=np.float64) - random) / (heuristic - random)
 
 
+def normalised(values: ArrayLike, anchors: Mapping[str, float]) -> Floats | None:
+    """Normalise returns by those of reference policies: 0 is "random", 1 the best other; None without a scale."""
+    low, high = anchors.get("random", np.nan), max((v for k, v in anchors.items() if k != "random"), default=np.nan)
+    return normalise(values, low, high) if low < high else None
+
+
 @dataclass(frozen=True)
 class Passing:
     """Env steps per seed at which a learning curve first is at or above a threshold; None where it never is."""

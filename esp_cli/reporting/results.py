@@ -26,7 +26,7 @@ from esp_cli.policies.statistics import (
     difference,
     interquartile_mean,
     leader,
-    normalise,
+    normalised,
     probability_of_improvement,
     summarise,
 )
@@ -156,7 +156,7 @@ def summarise_cell(results: Results, cell: CellResult) -> CellSummary | None:
     good = values[np.isfinite(values)]
     if not good.size or returns.mean is None:
         return CellSummary(returns)
-    scores, ours = _normalised(cell, good), (returns.mean, returns.sem, good.size)
+    scores, ours = normalised(good, cell.anchors), (returns.mean, returns.sem, good.size)
     return CellSummary(
         returns,
         iqm=interquartile_mean(good),
@@ -179,10 +179,10 @@ def aggregates(results: Results) -> dict[str, Aggregate]:
         pairs: dict[str, tuple[Floats, Floats]] = {}
         for cell in own:
             values = returns_of(cell, results.mode)
-            normalised = None if values is None or not np.isfinite(values).all() else _normalised(cell, values)
-            if values is None or normalised is None:
+            scaled = None if values is None or not np.isfinite(values).all() else normalised(values, cell.anchors)
+            if values is None or scaled is None:
                 break
-            scores[cell.panel] = normalised
+            scores[cell.panel] = scaled
             other = results.reference_of(cell)
             others = None if other is None or other.seeds != cell.seeds else returns_of(other, results.mode)
             if others is not None and np.isfinite(others).all() and others.size >= MIN_SEEDS_TO_RANK:
@@ -225,10 +225,3 @@ def side_of(interval: tuple[float, float] | None) -> Side | None:
         return None
     low, high = interval
     return "ahead" if low > 0 else "behind" if high < 0 else "level"
-
-
-def _normalised(cell: CellResult, values: Floats) -> Floats | None:
-    heuristics = [value for name, value in cell.anchors.items() if name != "random"]
-    if "random" not in cell.anchors or not heuristics or cell.anchors["random"] >= max(heuristics):
-        return None
-    return normalise(values, cell.anchors["random"], max(heuristics))

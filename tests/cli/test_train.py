@@ -17,7 +17,9 @@ from esp_cli import console
 from esp_cli.algorithms.learner import Iteration
 from esp_cli.algorithms.mappo import Mappo
 from esp_cli.checking import SymmetryReport, measured
+from esp_cli.policies.evaluation import rough_anchors
 from esp_cli.reporting.live import LIVE
+from esp_cli.run import Run
 from esp_cli.training.checkpoint import load_checkpoint
 from esp_cli.training.metrics import read_metrics
 from esp_cli.training.run_folder import RunFolder
@@ -75,7 +77,22 @@ def test_what_is_printed_where(tmp_path: Path) -> None:
         (row,) = (line for line in told.stdout.splitlines() if f" {mode} " in line)
         assert f"{last[f'eval/return_{mode}'][0]:.2f}" in row
     assert "training" not in told.stdout
+    assert "normalised" not in told.stdout + told.stderr, "two episodes give no scale"
     assert "no prior" in esp("train", *TINY_OPTIONS, *STEPS, "--out", tmp_path / "b", "--prior", "none").stderr
+
+
+def test_a_return_has_its_normalised_score_beside_it(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    options = ["evaluation.episodes=32" if "evaluation.episodes" in part else part for part in TINY_OPTIONS]
+    told = esp("train", *options, *STEPS, "--out", run)
+    anchors = rough_anchors(Run(run).config, 64)
+    assert list(anchors) == ["random", "heuristic", "cover"]
+    greedy = read_metrics(run / "metrics.jsonl")[-1]["eval/return_greedy"][0]
+    score = (greedy - anchors["random"]) / (max(anchors.values()) - anchors["random"])
+    (row,) = (line for line in told.stdout.splitlines() if " greedy " in line)
+    assert f"{score:.2f}" in row
+    assert f"normalised {score:.4g}" in told.stderr
+    assert "normalised: 0 random, 1 the best heuristic" in told.stdout
 
 
 @pytest.mark.parametrize(

@@ -12,10 +12,18 @@ import torch
 
 from esp_cli.networks.policy import StochasticPolicy
 from esp_cli.policies import evaluation as final
-from esp_cli.policies.evaluation import FinalEvaluation, evaluate, play_batches, summarise_returns
+from esp_cli.policies.evaluation import (
+    FinalEvaluation,
+    evaluate,
+    play_batches,
+    play_references,
+    rough_anchors,
+    summarise_returns,
+)
 from esp_cli.policies.loading import TrainedPolicy, _stopped
 from esp_cli.policies.statistics import SeedSummary
 from esp_cli.training.build import PolicyController, ScriptedController, build_environment, generators, play
+from esp_cli.training.config import resolve_config
 from tests.training.runs import tiny_config
 
 
@@ -130,3 +138,17 @@ def test_a_recurrent_policy_of_another_task_is_evaluated(tmp_path):
     result = evaluate(untrained(tmp_path, (3,), task="predator-prey", network__name="gru"), 2)
     assert set(result.metrics) == {"contact", "touches", "prey_distance"}
     assert result.greedy.sem is None
+
+
+def test_rough_anchors_are_near_those_of_many_episodes_and_absent_where_they_would_say_little() -> None:
+    config = resolve_config("predator-prey", seeds=[0, 1])
+    rough, many = (
+        rough_anchors(config, 64),
+        play_references(config, build_environment(config, 1, "shape").heuristics, 200),
+    )
+    for name, value in rough.items():
+        assert value == pytest.approx(float(many[name].returns.mean()), abs=12), "of 85 between them"
+    assert set(rough) == set(many)
+    assert rough_anchors(config, 1) == {}, "one episode has no error"
+    crowd = resolve_config("navigation", seeds=[0], overrides={"task.num_agents": 120, "task.num_landmarks": 120})
+    assert rough_anchors(crowd, 64) == {}, "one episode is more than a second's worth"
