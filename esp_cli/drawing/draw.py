@@ -8,7 +8,6 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -16,7 +15,7 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from esp_cli.defaults import SLOWEST
-from esp_cli.drawing.figures import INCHES, PAPER, PAPER_DPI, STEADY, UNDATED, summary
+from esp_cli.drawing.figures import INCHES, PAPER, PAPER_DPI, STEADY, saved, summary
 from esp_cli.drawing.films import GIF_FRAMES_PER_SECOND, Frame, frame, write_gif, write_mp4, write_png
 from esp_cli.drawing.recording import HOLD_SECONDS, Episode, Moment, framed, record
 from esp_cli.files.writing import write_file
@@ -138,11 +137,10 @@ def draw(
 
 def write_figure(request: Request, make: Callable[[], Figure]) -> None:
     """Make a figure in the style that was asked for, and write it as PNG, PDF or SVG."""
-    content, kind = BytesIO(), request.kind[1:]
     style, dpi = ({}, request.size / INCHES) if request.width is None else (PAPER, PAPER_DPI)
     with mpl.rc_context({**style, **STEADY}):
-        make().savefig(content, format=kind, dpi=dpi, metadata=UNDATED[kind])
-    write_file(request.out, content.getvalue())
+        content = saved(make(), request.kind[1:], dpi)
+    write_file(request.out, content)
 
 
 def _acting(request: Request, policies: Sequence[TrainedPolicy]) -> list[TrainedPolicy]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from io import BytesIO
 from itertools import groupby, pairwise
 from typing import Any
 
@@ -17,6 +18,7 @@ from matplotlib.patches import Circle, Rectangle
 
 from esp_cli.drawing.films import Mark, marks
 from esp_cli.drawing.recording import Episode
+from esp_cli.files.formatting import escaped
 from esp_envs.drawing import GRID, ink, trails
 from esp_envs.scene import DARK, Body, Scene, holders
 
@@ -39,6 +41,13 @@ _BARS, _BAR = 0.75, 0.28  # height of what is below the paths: of axis and legen
 _PANELS, _COLUMNS = 6, 3  # steps that a strip shows, and how many of them in a row
 _NUMBER = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
 _MARKERS = {"disc": "o", "ring": "o", "square": "s", "cross": "x"}
+
+
+def saved(figure: Figure, kind: str, dpi: float | None = None) -> bytes:
+    """Return a figure as PNG, SVG or PDF; an SVG with control characters, as of a task's name, opens nowhere."""
+    content = BytesIO()
+    figure.savefig(content, format=kind, dpi=dpi, metadata=UNDATED[kind])
+    return escaped(content.getvalue().decode()).encode() if kind == "svg" else content.getvalue()
 
 
 def summary(shown: Sequence[tuple[Episode, str]], period_s: float, width: float = INCHES) -> Figure:

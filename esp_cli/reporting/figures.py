@@ -10,7 +10,6 @@ import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
-from esp_cli.drawing.figures import PAPER, PAPER_DPI, STEADY, UNDATED
+from esp_cli.drawing.figures import PAPER, PAPER_DPI, STEADY, saved
 from esp_cli.files.formatting import attempting, format_span
 from esp_cli.files.writing import write_file
 from esp_cli.policies.statistics import bootstrap_interval, mean_and_sem
@@ -182,10 +181,9 @@ def written_figure(
         figure = Figure(figsize=size, layout="constrained")
         yield figure, Picture(png, svg, (size[0] * POINTS_PER_INCH, size[1] * POINTS_PER_INCH))
         for file in (png, svg, *([png.with_suffix(".pdf")] if for_print else [])):
-            content, kind = BytesIO(), file.suffix[1:]
-            figure.savefig(content, format=kind, metadata=UNDATED[kind])
+            content = saved(figure, file.suffix[1:])
             with attempting("write the figure", file, UserError):
-                write_file(file, content.getvalue())
+                write_file(file, content)
 
 
 def _titled(figure: Figure, title: str) -> Axes:

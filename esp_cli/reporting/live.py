@@ -44,6 +44,7 @@ class LivePage:
     def _page(self, step: int, complete: bool) -> str:
         trainer, film = self._trainer, b""
         config, spec = trainer.config, trainer.learner.spec
+        done = min(step, config.steps)  # the last update may go beyond
         curve = read_curve(trainer.folder.path, None, "greedy")
         with TemporaryDirectory() as scratch:
             ylabel = f"greedy return ({spec.convention})"
@@ -56,7 +57,7 @@ class LivePage:
                 draw(Request(drawn, episodes=1, view="top", size=_FILM_PIXELS, speed=speed, fps=rate), [trained])
                 film = drawn.read_bytes()
         return template("live.html").render(
-            title=f"{config.algorithm} on {config.task}, {format_count(step)} of {format_count(config.steps)} steps",
+            title=f"{config.algorithm} on {config.task}, {format_count(done)} of {format_count(config.steps)} steps",
             refresh=None if complete else _REFRESH_S,
             curve=data_uri(svg, "image/svg+xml"),
             film=data_uri(film, "image/gif") if film else "",

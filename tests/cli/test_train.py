@@ -384,13 +384,14 @@ def test_a_run_that_ends_within_its_warm_up_says_so(tmp_path: Path) -> None:
 
 
 def test_a_page_to_watch_shows_curve_and_policy_and_changes_nothing(tmp_path: Path) -> None:
-    plain = train_tiny(tmp_path / "plain")
+    plain = train_tiny(tmp_path / "plain", steps=120)
     told = esp("train", "--resume", plain, "--watch")
     assert "complete" in told.stderr
-    watched = train_tiny(tmp_path / "watched", "--watch")
+    watched = train_tiny(tmp_path / "watched", "--watch", steps=120)
     page = (watched / LIVE).read_text()
     assert page.count("data:image/svg+xml;base64,") == page.count("data:image/gif;base64,") == 1
     assert "The run is complete" in page
+    assert "120 of 120 steps" in page, "though the last update ends at 150"
     assert 'http-equiv="refresh"' not in page
     assert not (plain / LIVE).exists(), "off by default"
     same = [(run / "policy.safetensors").read_bytes() for run in (plain, watched)]
@@ -403,7 +404,6 @@ def test_a_page_that_cannot_be_drawn_is_told_once_and_stops_no_run(
     def fails(*_: object, **__: object) -> None:
         raise MemoryError("no room for pixels")
 
-    monkeypatch.setattr("esp_cli.reporting.live.draw", fails)
     monkeypatch.setattr("esp_cli.reporting.live.draw", fails)
     said = esp("train", "--steps", 100, *TINY_OPTIONS, "--out", tmp_path / "run", "--watch").stderr
     assert said.count("tracking with --watch ended: it cannot write (no room for pixels); the run goes on") == 1

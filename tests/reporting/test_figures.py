@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import namedtuple
+from xml.etree import ElementTree
 
 import matplotlib as mpl
 import numpy as np
@@ -147,6 +148,14 @@ def test_the_view_of_dots_is_that_of_the_groups(tmp_path, drawn):
 def test_names_are_not_mathematics(tmp_path):
     learning_curves([Panel("costs $5_000", [Curve("$x_{", STEPS, VALUES)])], tmp_path / "a", "y $")
     assert (tmp_path / "a.svg").stat().st_size > 0
+
+
+@pytest.mark.filterwarnings("ignore:Glyph")
+def test_a_name_with_control_characters_leaves_a_picture_that_opens_and_no_escape_in_it(tmp_path):
+    learning_curves([Panel("red\x1b[31m <b>", [Curve("a\x07", STEPS, VALUES)])], tmp_path / "a", "y\x00")
+    text = (tmp_path / "a.svg").read_text()
+    assert ElementTree.fromstring(text).tag.endswith("svg")
+    assert "red\\x1b[31m" in text
 
 
 @pytest.mark.parametrize(
