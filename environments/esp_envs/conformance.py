@@ -5,14 +5,16 @@
         print(finding.promise, finding.broken or "holds")
 
 Each promise is one function of a `Subject`. It returns nothing where the promise holds, and raises `Broken` with one
-sentence where it does not, or `NotAsked` where the task does not offer what the promise is about.
+sentence where it does not, `NotAsked` where the task does not offer what the promise is about, or `Unfinished` where
+the time for it is over.
 """
 
 from __future__ import annotations
 
 import re
+import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -23,6 +25,7 @@ from esp_envs.promises import (
     Broken,
     NotAsked,
     Subject,
+    Unfinished,
     a_joint_action_of_the_wrong_shape_is_refused,
     a_scene_can_be_drawn,
     actions_of_heuristics_and_chance_lie_in_the_action_space,
@@ -40,7 +43,7 @@ from esp_envs.promises import (
 )
 from esp_envs.spec import Continuous
 
-__all__ = ["PROMISES", "QUICK", "Broken", "Finding", "NotAsked", "Subject", "check"]
+__all__ = ["PROMISES", "QUICK", "Broken", "Finding", "NotAsked", "Subject", "Unfinished", "check"]
 
 
 def the_same_seed_gives_the_same_run(subject: Subject) -> None:
@@ -59,7 +62,7 @@ def a_seed_alone_equals_itself_among_others(subject: Subject) -> None:
     """Seed 7 gives the same run alone and among three seeds."""
     alone, among = subject.worlds(seeds=(7,)), subject.worlds(seeds=(3, 7, 11))
     require(equal(alone.reset().obs[0], among.reset().obs[1]), "a seed starts otherwise among others")
-    for _ in range(alone.spec.horizon + 5):
+    for _ in subject.steps(alone.spec.horizon + 5):
         own, joint = alone.random_action(), among.random_action()
         require(equal(own[0], joint[1]), "a seed draws other random actions among others")
         pairs = zip(tensors_of(alone.step(own)), tensors_of(among.step(joint)), strict=True)
@@ -71,7 +74,7 @@ def worlds_do_not_touch_each_other(subject: Subject) -> None:
     env, twin = subject.worlds(), subject.worlds()
     env.reset(), twin.reset()
     changed = False
-    for _ in range(env.spec.horizon + 3):
+    for _ in subject.steps(env.spec.horizon + 3):
         action = env.random_action()
         twin.random_action()
         different, mask = action.clone(), twin.action_mask()
@@ -93,7 +96,7 @@ def results_are_memory_of_their_own(subject: Subject) -> None:
     env.reset()
     start = twin.reset()
     start.obs.fill_(7), start.state.fill_(7)
-    for _ in range(env.spec.horizon + 2):
+    for _ in subject.steps(env.spec.horizon + 2):
         action = env.random_action()
         before = action.clone()
         step, marred = env.step(action), twin.step(twin.random_action())
@@ -116,11 +119,11 @@ def a_saved_environment_goes_on_bit_for_bit(subject: Subject) -> None:
     env, other = subject.worlds(), subject.worlds(seeds=(100, 101))
     require_method(env, "state_dict", "a run that is resumed begins new episodes")
     env.reset(), other.reset()
-    for _ in range(env.spec.horizon // 2):
+    for _ in subject.steps(env.spec.horizon // 2):
         env.step(env.random_action())
     saved = env.state_dict()
     copies = {name: value.clone() for name, value in saved.items()}
-    expected = [env.step(env.random_action()) for _ in range(env.spec.horizon + 5)]
+    expected = [env.step(env.random_action()) for _ in subject.steps(env.spec.horizon + 5)]
     intact = all(equal(saved[name], copies[name]) for name in copies)
     require(intact, "what 'state_dict' returned changes when the environment goes on")
     other.load_state_dict(copies)
@@ -176,7 +179,7 @@ def set_state_starts_an_episode(subject: Subject) -> None:
         env.step(env.random_action())
     env.set_state(observation.state)
     alive = torch.ones(env.num_seeds, env.num_envs, dtype=torch.bool, device=env.device)
-    for t in range(env.spec.horizon):
+    for t in subject.steps(env.spec.horizon):
         step = env.step(env.random_action())
         alive &= ~step.terminated
         due = alive & (t == env.spec.horizon - 1)
@@ -206,11 +209,12 @@ PROMISES: tuple[Callable[[Subject], None], ...] = (
 
 @dataclass(frozen=True)
 class Finding:
-    """The result of one promise: `broken` and `not_asked` are sentences; both are None where it holds."""
+    """The result of one promise: `broken`, `not_asked` and `not_covered` are sentences; all are None where it holds."""
 
     promise: str
     broken: str | None = None
     not_asked: str | None = None
+    not_covered: str | None = None
 
 
 QUICK = (observations_rewards_and_metrics_fit_the_spec, the_same_seed_gives_the_same_run)
@@ -218,12 +222,18 @@ QUICK = (observations_rewards_and_metrics_fit_the_spec, the_same_seed_gives_the_
 
 
 def check(subject: Subject, promises: Sequence[Callable[[Subject], None]] = PROMISES) -> Iterator[Finding]:
-    """Check promises in turn; a task that raises breaks the promise, and only the first where all fail alike."""
+    """Check promises in turn; a task that raises breaks the promise, and only the first where all fail alike.
+
+    Each but the last has at most half of the time that is left, so that long ones leave some for the others.
+    """
     raised: set[str] = set()
     for promise in promises:
         name = promise.__name__.replace("_", " ")
+        until = subject.deadline if promise is promises[-1] else (time.monotonic() + subject.deadline) / 2
         try:
-            promise(subject)
+            promise(replace(subject, deadline=until))
+        except Unfinished as seen:
+            yield Finding(name, not_covered=str(seen))
         except NotAsked as reason:
             yield Finding(name, not_asked=str(reason))
         except Broken as failure:

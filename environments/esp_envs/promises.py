@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -27,6 +26,10 @@ class NotAsked(ValueError):  # noqa: N818
     """A promise does not concern a task; the message says why."""
 
 
+class Unfinished(ValueError):  # noqa: N818
+    """The time is over, and what was seen until then keeps the promise; the message says how much that is."""
+
+
 @dataclass(frozen=True)
 class Subject:
     """A task to check."""
@@ -34,13 +37,17 @@ class Subject:
     make: MakeWorlds  # makes the worlds, given E and the seeds
     rounding: float = 0.0  # how far a step from a restored state may differ, where physics is finer than float32
     align: Callable[[Environment, Environment, int], None] | None = None  # gives the second the first's chance
-    deadline: float = math.inf  # at which `time.monotonic` promises about many steps stop looking
+    deadline: float = math.inf  # at which `time.monotonic` promises stop looking
 
     def worlds(self, num_envs: int = WORLDS, seeds: Sequence[int] = SEEDS) -> Environment:
         return self.make(num_envs, seeds)
 
     def steps(self, count: int) -> Iterator[int]:
-        return itertools.takewhile(lambda _: time.monotonic() < self.deadline, range(count))
+        """Count so many steps; raise `Unfinished` where the time is over before."""
+        for done in range(count):
+            if time.monotonic() >= self.deadline:
+                raise Unfinished(f"the time was over after {done} of {count} steps")
+            yield done
 
 
 def tensors_of(step: Step) -> list[Tensor]:
@@ -106,7 +113,8 @@ def require_equal(what: str, got: object, expected: object) -> None:
     require(got == expected, f"{what} is {got}, expected {expected}")
 
 
-_MANY = 40  # worlds among which some end early at random
+_MANY, _ENOUGH = 40, 4000
+"""Worlds among which some end early at random, and steps of an episode times worlds that are enough."""
 
 
 def observations_rewards_and_metrics_fit_the_spec(subject: Subject) -> None:
@@ -189,10 +197,10 @@ def episodes_end_when_the_spec_says(subject: Subject) -> None:
     env = subject.worlds()
     horizon, terminates = env.spec.horizon, env.spec.terminates
     if terminates:
-        env = subject.worlds(_MANY)
+        env = subject.worlds(max(WORLDS, min(_MANY, _ENOUGH // horizon)))
     age = torch.zeros(env.num_seeds, env.num_envs, device=env.device)
     env.reset()
-    for t in range(2 * horizon + 3):
+    for t in subject.steps(2 * horizon + 3):
         if t == 2 * horizon + 1:  # in mid-episode
             env.reset()
             age.zero_()

@@ -87,7 +87,9 @@ class PartsKind(Kind):
                 return np.array(rows)
         if np.allclose(planar, np.eye(2), atol=1e-9):
             return np.eye(self.width)
-        known = ", ".join(element.name for element, _ in self.moves) or "none"
+        known = ", ".join(element.name for element, _ in self.moves)
+        if not known:
+            raise UserError(f"the body has no symmetry for its {self.name}")
         raise UserError(f"the body has no such symmetry for its {self.name}; it has {known}")
 
 

@@ -23,6 +23,10 @@ _MOST = 64
 """Of longer lists only generators are tried: where these hold, so do their products."""
 
 
+class NothingToTry(UserError):  # noqa: N818
+    """No element can be tried on a task; the message says why."""
+
+
 def candidates(spaces: Spaces, transforms: str | None = None) -> list[Element]:
     """Return the elements to try: those asked for, else of polygons, any angle, exchanges of two agents or like items.
 
@@ -34,7 +38,8 @@ def candidates(spaces: Spaces, transforms: str | None = None) -> list[Element]:
         transforms: text as `--transforms` takes it.
 
     Raises:
-        UserError: the text means nothing, or nothing that is asked for can be tried.
+        UserError: the text means nothing.
+        NothingToTry: nothing that is asked for can be tried.
     """
     texts = [transforms] if transforms is not None else _defaults(spaces)
     refusals = _refusals(texts, spaces)
@@ -44,7 +49,7 @@ def candidates(spaces: Spaces, transforms: str | None = None) -> list[Element]:
     found = [element for element in possible if transforms is not None or first[moves[element]] == element]
     if not found:
         said = next(iter(refusals.values()), None)
-        raise UserError(f"no transform can be tried on {spaces.label}: {said or 'none is named'}")
+        raise NothingToTry(f"no transform can be tried on {spaces.label}: {said or 'none is named'}")
     return found
 
 

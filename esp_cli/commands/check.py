@@ -47,8 +47,8 @@ def check(
     """Check what every task promises, or a task's declared symmetry.
 
     Symmetry is tested per element and field: it holds, is broken, or is not covered (no data could have shown a
-    breaking). Exit code 0: all that is declared holds; 1: something is broken; 2: something declared is not
-    covered.
+    breaking). Exit code 0: all that is promised or declared holds; 1: something is broken; 2:
+    something is not covered.
     """
     from esp_cli.training.config import resolve_task_settings
     from esp_envs.registry import make
@@ -64,7 +64,7 @@ def check(
 
     spec = make_worlds(1, [0]).spec  # a mistake in task or settings is the user's, not a broken promise
     if what == "task":
-        code = _check_task(task, spec, make_worlds, json)
+        code = _check_task(task, spec, make_worlds, seconds, json)
     elif spec.roles:
         if policy is not None:
             raise UserError(f"{task} has roles, of whose policies nothing is measured here; leave --policy out")
@@ -75,16 +75,27 @@ def check(
         raise typer.Exit(code)
 
 
-def _check_task(task: str, spec: TaskSpec, make_worlds: MakeWorlds, json: str | None) -> int:
-    from esp_envs.conformance import Subject, check
+def _check_task(task: str, spec: TaskSpec, make_worlds: MakeWorlds, seconds: float, json: str | None) -> int:
+    from esp_envs.conformance import PROMISES, Subject, check
 
-    symmetries = [_of_the_symmetry(role, bool(spec.roles)) for role, _ in spec.parts]
-    findings = [*symmetries, *check(Subject(make_worlds, rounding=_ROUNDING))]
-    rows = [(f.promise, "broken" if f.broken else "-" if f.not_asked else "holds", f.broken or f.not_asked or "")
-            for f in findings]  # fmt: skip
+    findings = [_of_the_symmetry(role, bool(spec.roles)) for role, _ in spec.parts]
+    subject = Subject(make_worlds, rounding=_ROUNDING, deadline=time.monotonic() + seconds)
+    with console.watching("check", "promises") as watch:
+        for done, finding in enumerate(check(subject), 1):
+            findings.append(finding)
+            watch(done, len(PROMISES))
+    rows = [(f.promise, *_result(f)) for f in findings]
+    late = [f.promise for f in findings if f.not_covered]
     title = f"What {task} promises as a task"
     console.result(json, findings, lambda: console.table(("promise", "result", "what happens"), rows, title=title))
-    return int(any(finding.broken for finding in findings))
+    if late:
+        console.note(f"{len(late)} of {len(rows)} promises were not looked at to their end; give more by --seconds")
+    return 1 if any(finding.broken for finding in findings) else 2 * bool(late)
+
+
+def _result(finding: Finding) -> tuple[str, str]:
+    results = {"broken": finding.broken, "not covered": finding.not_covered, "-": finding.not_asked, "holds": ""}
+    return next((result, told) for result, told in results.items() if told is not None)
 
 
 def _of_the_symmetry(spec: TaskSpec, of_role: bool = False) -> Finding:
@@ -130,14 +141,23 @@ def _check_symmetry(
     make_worlds: MakeWorlds, transforms: str | None, policy: Path | None, seconds: float, json: str | None
 ) -> int:
     from esp_cli.checking import check_policy, check_symmetry
+    from esp_cli.checking.candidates import NothingToTry
 
     trained = None
     if policy is not None:
         from esp_cli.policies.loading import open_policy
 
         trained = open_policy(policy)
-    with console.watching("check", "elements") as watch:
-        report = check_symmetry(make_worlds, transforms, watch=watch, seconds=seconds)
+    try:
+        with console.watching("check", "elements") as watch:
+            report = check_symmetry(make_worlds, transforms, watch=watch, seconds=seconds)
+    except NothingToTry as told:
+        spec, why = make_worlds(1, [0]).spec, str(told)
+        if trained is not None or transforms is not None or spec.symmetry != "c1" or spec.nearly:
+            raise
+        said = f"{why}; the task declares no symmetry either, so all that is declared holds"
+        console.result(json, {"report": None, "holds": True, "policy": []}, lambda: console.say(said))
+        return 0
     measured: list[PolicyVerdict] = []
     if trained is not None:
         measured = check_policy(trained, make_worlds, transforms)
@@ -157,8 +177,19 @@ def _print(report: SymmetryReport, measured: Sequence[PolicyVerdict]) -> None:
             f"of them, {missing} might"
         )
     if measured:
-        agreeing = [(m.element, f"{m.agreement:.3f}") for m in measured]
-        console.table(("element", "same greedy action>"), agreeing, title="Symmetry of the policy")
+        _print_policy(measured)
+
+
+def _print_policy(measured: Sequence[PolicyVerdict]) -> None:
+    from esp_cli.checking.policy import CLOSE
+
+    columns: tuple[str, ...] = ("element", "same greedy action>")
+    caption = "share of agents and states in which the greedy action is the transformed one"
+    if any(m.distance is not None for m in measured):
+        columns = ("element", f"greedy action within {CLOSE:g}>", "distance>")
+        caption += f" within {CLOSE:g} in every number; distance: 0 where it is that, 1 as of unrelated states"
+    rows = [(m.element, f"{m.agreement:.3f}", f"{m.distance or 0:.3g}")[: len(columns)] for m in measured]
+    console.table(columns, rows, title="Symmetry of the policy", caption=caption)
 
 
 def print_elements(report: SymmetryReport, found: str) -> None:

@@ -219,7 +219,7 @@ JsonOption = Annotated[
 SecondsOption = Annotated[
     float,
     typer.Option(
-        "--seconds", min=1, help="Time for it; elements that do not fit in are not covered. Declared ones come first."
+        "--seconds", min=1, help="Time for it; what does not fit in is not covered. Declared elements come first."
     ),
 ]
 ForceOption = Annotated[bool, typer.Option("--force", help="Overwrite existing output.")]

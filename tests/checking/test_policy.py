@@ -49,6 +49,35 @@ def test_an_equivariant_network_agrees_everywhere_and_a_plain_one_does_not() -> 
     assert max(agreements(untrained(network__hidden=[8])).values()) < 0.9
 
 
+class GoesWhereItLooks(torch.nn.Module):
+    """Continuous actions that are symmetric, but for a drift."""
+
+    def __init__(self, drift: float) -> None:
+        super().__init__()
+        self.drift = drift
+
+    def initial_memory(self, count: int, obs: Tensor) -> None:
+        return None
+
+    def act(self, obs: Tensor, memory: None, action_mask: Tensor | None = None) -> tuple[Tensor, None]:
+        return obs[..., 2:4].clamp(-1, 1) + torch.tensor([self.drift, 0.0]), None
+
+
+@pytest.mark.parametrize(("drift", "agreement", "apart"), [(0.0, 1.0, 0.0), (0.04, 1.0, None), (0.06, 0.0, None)])
+def test_continuous_actions_agree_within_a_tenth_and_have_a_distance(drift, agreement, apart) -> None:
+    trained = untrained(network__hidden=[8], task__actions="continuous")
+    trained = TrainedPolicy(trained.config, GoesWhereItLooks(drift), trained.spec, 0, trained.source)
+    (mirror,) = check_policy(trained, worlds(actions="continuous"), "flip-y,rot180")[:1]
+    assert mirror.agreement == agreement, "a drift of x counts twice where x is mirrored"
+    assert mirror.distance is not None
+    assert mirror.distance == pytest.approx(0, abs=1e-6) if apart == 0 else 0 < mirror.distance < 0.5
+
+
+def test_discrete_actions_have_no_distance() -> None:
+    (verdict,) = check_policy(untrained(network__hidden=[8]), worlds(), "rot90")
+    assert verdict.distance is None
+
+
 def test_a_policy_that_remembers_is_judged_with_what_it_remembers() -> None:
     trained = untrained(network__hidden=[8])
     trained = TrainedPolicy(trained.config, SymmetricAtFirst(), trained.spec, 0, trained.source)

@@ -195,6 +195,31 @@ def test_check_measures_a_policy_too(folder: Path) -> None:
     assert all(0 <= m["agreement"] <= 1 for m in result["policy"])
 
 
+def test_nothing_to_try_is_no_fault_of_a_task_that_declares_nothing(folder: Path) -> None:
+    (folder / "speedy.py").write_text(
+        "import torch\n"
+        "from esp_envs import BatchedTask, Discrete, Field, Kind, TaskSpec, layout\n"
+        "class Speedy(BatchedTask):\n"
+        "    def _describe(self):\n"
+        "        act = Discrete(Kind.SCALAR, ((0.0,), (1.0,)), ('stay', 'push'))\n"
+        "        seen = layout(Field('speed', Kind.SCALAR))\n"
+        "        return TaskSpec(name='speedy', version=1, convention='speed', horizon=5, num_agents=1,\n"
+        "            observation=seen, action=act, state=seen, symmetry='c1')\n"
+        "    def _start(self, generator):\n"
+        "        return {'speed': self.draw(1, 1, generator=generator)}\n"
+        "    def _advance(self, world, action):\n"
+        "        world['speed'] = world['speed'] + action.unsqueeze(-1)\n"
+        "        return world['speed'].mean((-1, -2)), {}\n"
+        "    def _observe(self, world):\n"
+        "        return world['speed']\n"
+    )
+    shown = esp(folder, "check", "symmetry", "speedy:Speedy", "--json", "-")
+    assert json.loads(shown.stdout) == {"report": None, "holds": True, "policy": []}
+    assert "declares no symmetry either" in esp(folder, "check", "symmetry", "speedy:Speedy").stdout
+    asked = esp(folder, "check", "symmetry", "speedy:Speedy", "--transforms", "flip-x", code=2)
+    assert "no transform can be tried on speedy" in asked.stderr
+
+
 def test_check_refuses_what_it_does_not_take(folder: Path) -> None:
     for words in (["--transforms", "d4"], ["--policy", "run"], ["--network", "mine:Network"]):
         told = esp(folder, "check", "task", "navigation", *words, code=2).stderr

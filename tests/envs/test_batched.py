@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import re
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from esp_envs import BatchedTask, Environment, Field, Kind, Scene, generators_for, layout, to_others
+from esp_envs import BatchedTask, Environment, Field, Kind, Scene, generators_for, layout, make, to_others
 from esp_envs.conformance import PROMISES, Broken, NotAsked, Subject, check
 from esp_envs.mpe.task import MOVES
 from esp_envs.spec import Continuous, TaskSpec, discrete_moves
@@ -405,3 +406,15 @@ def test_a_task_that_raises_is_a_finding_too() -> None:
     findings = list(check(Subject(lambda num_envs, seeds: worlds(Raising, num_envs, seeds))))
     assert findings[0].broken == "KeyError: 'speed'"
     assert len(findings) == len(PROMISES)
+
+
+def test_a_check_that_has_no_time_says_what_it_did_not_cover_and_nothing_holds_unseen() -> None:
+    late = Subject(lambda count, seeds: make("navigation", count, seeds), deadline=time.monotonic() - 1)
+    findings = {finding.promise: finding for finding in check(late)}
+    assert len(findings) == len(PROMISES)
+    assert not any(finding.broken for finding in findings.values())
+    ends = findings["episodes end when the spec says"]
+    assert ends.not_covered == "the time was over after 0 of 53 steps"
+    assert findings["a joint action of the wrong shape is refused"].not_covered is None
+    done = check(Subject(lambda count, seeds: make("navigation", count, seeds)))
+    assert not any(finding.not_covered for finding in done), "without a deadline all is looked at"
