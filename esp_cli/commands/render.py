@@ -12,6 +12,7 @@ from esp_cli import console
 from esp_cli.commands import options
 from esp_cli.defaults import SLOWEST
 
+_EPISODES = 64  # of the reference policies, at most
 EPILOG = """Examples:\n
     esp render formation -o f.gif\n
     esp render runs/cn-mappo -o cn.gif\n
@@ -82,7 +83,9 @@ def render(
     A picture shows paths, and when each agent covers a landmark or catches the prey. Wildlife's shows the last steps.
     """
     from esp_cli.drawing.draw import Request, draw
+    from esp_cli.policies.evaluation import rough_anchors
     from esp_cli.policies.loading import open_policy
+    from esp_cli.policies.statistics import normalised
 
     request = Request(out, seed, episodes, view, size, speed, fps, width, not stochastic)
     options.register_named(task, [algo], network)
@@ -97,3 +100,8 @@ def render(
     picture = f"episode of {drawing.steps} steps -> {out}"
     for text in filter(None, (drawing.note, picture if request.is_picture else film)):
         console.note(text)
+    anchors = rough_anchors(opened[0].config, _EPISODES)
+    for where, value in zip(named, drawing.returns, strict=True):
+        scaled = normalised(value, anchors)
+        score = "" if scaled is None else f", normalised {scaled:.2f} (0 random, 1 the best heuristic)"
+        console.note(f"{where.name}: return {value:.1f}{score}")

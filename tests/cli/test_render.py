@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from esp_cli.policies.evaluation import rough_anchors
+from esp_cli.run import Run
 from esp_envs.epuck import gl
 from tests.cli.running import esp, refused, train_tiny
 
@@ -21,6 +23,11 @@ def test_a_gif_has_every_step_of_every_episode_in_real_time(finished: Path, tmp_
     assert told.stdout == ""
     assert f"{2 * FRAMES} frames -> {file}" in told.stderr
     assert f"{2 * FRAMES}/{2 * FRAMES}" in told.stderr, "progress is shown"
+    (said,) = re.findall(r": return (\S+), normalised (\S+) \(0 random, 1 the best heuristic\)", told.stderr)
+    drawn = Run(finished).render(tmp_path / "again.gif", episodes=2, size=64).returns[0]
+    anchors = rough_anchors(Run(finished).config, 64)
+    score = (drawn - anchors["random"]) / (max(anchors.values()) - anchors["random"])
+    assert said == (f"{drawn:.1f}", f"{score:.2f}")
     with Image.open(file) as film:
         assert film.format == "GIF"
         assert film.n_frames == 2 * FRAMES
