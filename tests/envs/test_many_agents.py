@@ -217,3 +217,14 @@ def test_the_other_tasks_take_many_agents_too(task, settings):
         step = env.step(env.heuristic())
         assert bool(step.next.obs.isfinite().all())
         assert step.reward.shape[-1] in settings.values()
+
+
+@pytest.mark.parametrize(("task", "agents"), [("navigation", "num_agents"), ("predator-prey", "num_predators")])
+def test_worlds_are_made_without_a_look_at_pairs_of_bodies_that_stand_nowhere_yet(task, agents, monkeypatch):
+    looked = []
+    monkeypatch.setattr(many.ManyWorlds, "_measure_by_tree", lambda *_: looked.append(1))
+    env = make(task, 2, [0], {agents: 300, "sees": 4, "density": 3.0})
+    assert not looked, "all lie in one place, so that these are N^2"
+    monkeypatch.undo()
+    env.reset()
+    assert env.worlds._near.shape[1] < 300**2 / 4

@@ -51,6 +51,7 @@ class ManyWorlds(ParticleWorlds):
         self.seen_agents, self.seen_landmarks = (
             torch.zeros(*seen, count, dtype=torch.int64, device=device) if sees else None for count in self._sees
         )
+        self._near = torch.zeros(3, 0, dtype=torch.int64, device=device)  # before any are placed, no pairs
         super().__init__(bodies, num_worlds, device, velocity_first)
 
     def measure(self) -> None:

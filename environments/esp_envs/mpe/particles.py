@@ -106,7 +106,6 @@ class ParticleWorlds:
         self._gain = _rows(torch.tensor(bodies.gain) * DT_S, lanes).unsqueeze(1).repeat(1, 2, 1).to(device)
         limit = None if bodies.max_speed is None else _rows(torch.tensor(bodies.max_speed), lanes).to(device)
         self._max_speed = limit
-        self.measure()
 
     def rows(self) -> Tensor:
         """Return the physics of the real worlds as a view of shape [2 (2A + L), W]."""
