@@ -133,14 +133,15 @@ class Spaces:
     @property
     def is_joint(self) -> bool:
         """Whether the state is all agents' observations end to end."""
-        return self.state == joint_layout(self.observation, self.num_agents)
+        return self.joint_fields == slice(0, len(self.state.fields))
 
     @property
     def joint_fields(self) -> slice | None:
         """Which fields of the state are all agents' observations end to end; None where there are none."""
-        own = joint_layout(self.observation, self.num_agents).fields
-        starts = range(len(self.state.fields) - len(own) + 1)
-        ends = (slice(k, k + len(own)) for k in starts if self.state.fields[k : k + len(own)] == own)
+        count = self.num_agents * len(self.observation.fields)
+        starts = range(len(self.state.fields) - count + 1)
+        own = joint_layout(self.observation, self.num_agents).fields if starts else ()  # which takes time for many
+        ends = (slice(k, k + count) for k in starts if self.state.fields[k : k + count] == own)
         return next(ends, None)
 
     @property

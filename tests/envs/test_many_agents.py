@@ -228,3 +228,10 @@ def test_worlds_are_made_without_a_look_at_pairs_of_bodies_that_stand_nowhere_ye
     monkeypatch.undo()
     env.reset()
     assert env.worlds._near.shape[1] < 300**2 / 4
+
+
+def test_a_state_that_is_no_row_of_observations_is_told_by_its_number_of_fields(monkeypatch):
+    env = make("predator-prey", 1, [0], {"num_predators": 300, "sees": 4})
+    monkeypatch.setattr("esp_envs.spec.joint_layout", lambda *_: pytest.fail("lists a field of each agent"))
+    assert env.spec.joint_fields is None
+    assert not env.spec.is_joint
