@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import cache
-from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -62,10 +61,12 @@ class Quadruped(BatchedTask):
 
     def __init__(self, settings: TaskSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
         super().__init__(settings, num_envs, generators)
-        self._batch = Batch(_body()[1], nsim=num_envs * len(generators), nthread=torch.get_num_threads())
+        self.model = _body()[1]
+        self.data = mujoco.MjData(self.model)  # of the world that is drawn
+        self._paint = painter_of(self)
+        self._batch = Batch(self.model, nsim=num_envs * len(generators), nthread=torch.get_num_threads())
         names = ("qpos", "qvel", "qacc_warmstart", "ctrl", "actuator_force")
         self._rows = {name: self._batch.bind(name) for name in names}  # outputs are filled from the next step on
-        self._drawn: list[object] = []
 
     def _describe(self) -> TaskSpec:
         body = _body()[0]
@@ -156,14 +157,9 @@ class Quadruped(BatchedTask):
         return target.flatten(-2).clamp(-1, 1).unsqueeze(-2)
 
     def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
-        model = _body()[1]
-        if not self._drawn:
-            data = mujoco.MjData(model)
-            self._drawn += [data, painter_of(SimpleNamespace(model=model, data=data))]
-        data, paint = self._drawn
-        data.qpos[:] = torch.cat([self.world[name][world].flatten() for name in _POSITIONS]).cpu()  # type: ignore[attr-defined]
-        mujoco.mj_forward(model, data)
-        picture = paint()  # type: ignore[operator]
+        self.data.qpos[:] = torch.cat([self.world[name][world].flatten() for name in _POSITIONS]).cpu().numpy()
+        mujoco.mj_forward(self.model, self.data)
+        picture = self._paint()
         return Scene((), (0.0, picture.shape[1], 0.0, picture.shape[0]), picture=picture)
 
     def _felt(self, world: World) -> tuple[Tensor, Tensor, Tensor, Tensor]:
