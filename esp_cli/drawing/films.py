@@ -134,6 +134,8 @@ def _total(moment: Moment) -> str:
 def _scale(scene: Scene, flat: bool) -> str:
     if flat:
         return f"axes in {scene.unit}" if scene.unit else ""
+    if scene.picture is not None:  # whose window is counted in pixels
+        return ""
     x_min, x_max, y_min, y_max = scene.window
     return f"floor {x_max - x_min:g} x {y_max - y_min:g} {scene.unit}"
 

@@ -151,3 +151,9 @@ def test_agents_have_letters_on_them_or_beside_them() -> None:
         assert beside
         assert all(row < 0 < column for row, column in beside)
     assert not letters(0.2, "")
+
+
+def test_the_size_of_the_floor_is_told_where_it_is_known() -> None:
+    pixels = np.zeros((48, 64, 3), np.uint8)
+    assert frames._scale(Scene((), (-1, 1, -2, 2), unit="m"), flat=False) == "floor 2 x 4 m"
+    assert frames._scale(Scene((), (0, 64, 0, 48), picture=pixels), flat=False) == ""
