@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import struct
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -104,13 +106,9 @@ def of_tensorboard(run: Path) -> Curves:
 
 
 def of_wandb(run: Path) -> Curves:
-    from wandb.proto import wandb_internal_pb2
-
     found: Curves = {}
     for file in sorted(run.glob("wandb/offline-run-*/run-*.wandb")):
-        for content in _log_records(file.read_bytes()[7:]):
-            record = wandb_internal_pb2.Record()
-            record.ParseFromString(content)
+        for record in _whole_run(file):
             row: dict[str, Any] = {
                 (item.key or "/".join(item.nested_key)): json.loads(item.value_json) for item in record.history.item
             }
@@ -118,6 +116,24 @@ def of_wandb(run: Path) -> Curves:
                 if not name.startswith("_") and name != "step":
                     found.setdefault(name, []).append((row["step"], value))
     return found
+
+
+def _whole_run(file: Path, seconds: float = 60) -> list[Any]:
+    """Return a run's records up to its exit, which wandb's own process may write after the run was told of its end."""
+    from google.protobuf.message import DecodeError
+    from wandb.proto.wandb_internal_pb2 import Record
+
+    until = time.monotonic() + seconds
+    while True:
+        records = []
+        with contextlib.suppress(DecodeError):  # what is not written to its end
+            for content in _log_records(file.read_bytes()[7:]):
+                record = Record.FromString(content)
+                records.append(record)
+        if records and records[-1].WhichOneof("record_type") == "exit":
+            return records
+        assert time.monotonic() < until, f"{file} does not end"
+        time.sleep(0.05)
 
 
 def _log_records(content: bytes, first_block: int = 32768 - 7) -> Iterator[bytes]:
