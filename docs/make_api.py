@@ -1,4 +1,4 @@
-"""Write docs/api.md from the docstrings, and the signatures that its test holds: python docs/make_api.py."""
+"""The site's API page, made of the docstrings; and the signatures that its test holds: python docs/make_api.py."""
 
 from __future__ import annotations
 
@@ -14,13 +14,12 @@ from typing import Any
 
 import esp_cli
 
-PAGE = Path(__file__).parent / "api.md"
 SIGNATURES = Path(__file__).parents[1] / "tests" / "library" / "signatures.json"
 _HEAD = """# API reference
 
 What `esp_cli.__all__` lists is public: `from esp_cli import Symmetry, train`. A change of a signature stands in the
-[changelog](../CHANGELOG.md). `python docs/make_api.py` writes this page from the docstrings;
-[the library page](library.md) shows how the parts work together.
+[changelog](../changelog.md). `make site` makes this page from the docstrings, which `help(esp_cli.train)` shows too;
+[the library page](../library.md) shows how the parts work together.
 """
 _GROUPS = {
     "Train and use a policy": ("train", "Run", "Metrics", "Progress", "load_policy", "LoadedPolicy"),
@@ -112,8 +111,7 @@ def _item(item: str) -> str:
 
 
 def main() -> None:
-    """Write the page and the signatures; a changed signature needs a line of the changelog that no earlier one used."""
-    PAGE.write_text(page(), encoding="utf-8")
+    """Write the signatures; a changed one needs a line of the changelog that no earlier one used."""
     found, held = signatures(), json.loads(SIGNATURES.read_text(encoding="utf-8"))
     if held["changes"][-1]["digest"] != digest(found):
         line = input("a signature changed; the line of CHANGELOG.md that says so: ")

@@ -27,8 +27,11 @@ left out, since the tests do not install them. `docs/make_dependencies.py` write
 `pip-audit -r constraints.txt` compares these versions with the database of known vulnerabilities. The project's own
 checks run where this database cannot be reached. This page does not say that a version has no vulnerability.
 
-| package | version | released | needed by |
-|---|---|---|---|
+"""
+_TABLE = """## {title}
+
+| package | version | released |
+|---|---|---|
 """
 
 
@@ -59,15 +62,15 @@ def released(package: dict[str, Any]) -> datetime:
 def page(lock: dict[str, Any]) -> str:
     """Return the page, the project's own dependencies first."""
     known, own = pinned(), direct()
-    rows = [
-        (p["name"] not in own, p["name"], p["version"], f"{released(p):%Y-%m-%d}")
-        for p in lock["packages"]
-        if (p["name"], p["version"]) in known
-    ]
-    return _BEGIN + "".join(
-        f"| {name} | {version} | {date} | {'another package' if indirect else 'esp-marl'} |\n"
-        for indirect, name, version, date in sorted(rows)
-    )
+    text = _BEGIN
+    for title, named in (("Named by the project", True), ("Needed by these", False)):
+        rows = sorted(
+            (p["name"], p["version"], f"{released(p):%Y-%m-%d}")
+            for p in lock["packages"]
+            if (p["name"], p["version"]) in known and (p["name"] in own) == named
+        )
+        text += _TABLE.format(title=title) + "".join(f"| {' | '.join(row)} |\n" for row in rows) + "\n"
+    return text.rstrip() + "\n"
 
 
 if __name__ == "__main__":

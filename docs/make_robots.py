@@ -24,13 +24,19 @@ derived and proven. A gap is that of the worst joint's accelerations, as a share
 stands the gap of the least mistake that was planted. Files without a joint, and parts that are no model by
 themselves, are left out ({left}).
 
-| model | symmetry | verdict | joints | gap | of a planted mistake |
-|---|---|---|---:|---:|---:|
+| model | joints | symmetry | verdict | gap | of a planted mistake |
+|---|---:|---|---|---:|---:|
+"""
+_NONE = """
+## Without a symmetry
+
+| model | joints | what is in the way |
+|---|---:|---|
 """
 
 
-def rows(package: str, root: Path) -> Iterator[str | None]:
-    """Yield a row of the table for each model of a package; None for a file that is none."""
+def rows(package: str, root: Path) -> Iterator[list[str] | None]:
+    """Yield a row of a table for each model of a package, of six cells or three; None for a file that is none."""
     for path in sorted(root.rglob("*.xml")):
         try:
             body = Body.from_mjcf(read_model(path, root))
@@ -38,17 +44,24 @@ def rows(package: str, root: Path) -> Iterator[str | None]:
             yield None
             continue
         name = path.relative_to(root).as_posix().removeprefix("envs/").replace("/assets/", "/")
-        joints = str(len(body.joints))
-        cells = ["none", "; ".join(f"{k}: {v}" for k, v in list(body.refused.items())[:1]), joints, "", ""]
+        cells = [f"{package} {name}", str(len(body.joints))]
         if body.found:
             proof = next(iter(body.found.values())).proof
-            cells = [body.group, proof.verdict, joints, f"{proof.gap:.1g}", f"{proof.planted.min():.2g}"]
-        yield f"| {package} {name} | {' | '.join(cells)} |"
+            yield [*cells, body.group, proof.verdict, f"{proof.gap:.1g}", f"{proof.planted.min():.2g}"]
+        else:
+            yield [*cells, *(f"{element}: {why}" for element, why in list(body.refused.items())[:1])]
+
+
+def page(table: list[list[str]], left: int) -> str:
+    """Return the page of these rows, and of how many files were left out."""
+    held, none = ([row for row in table if (len(row) > 3) == symmetric] for symmetric in (True, False))
+    tables = ["".join(f"| {' | '.join(row)} |\n" for row in part) for part in (held, none)]
+    return _HEAD.format(held=len(held), tried=len(table), left=left) + _NONE.join(tables)
 
 
 def main() -> None:
     """Write the page."""
-    table: list[str] = []
+    table: list[list[str]] = []
     left = 0
     for package in sys.argv[1:]:
         spec = importlib.util.find_spec(package)
@@ -58,9 +71,7 @@ def main() -> None:
         for row in rows(package, Path(spec.submodule_search_locations[0])):
             table += [] if row is None else [row]
             left += row is None
-    held = sum("| none |" not in row for row in table)
-    text = _HEAD.format(held=held, tried=len(table), left=left) + "\n".join(table) + "\n"
-    PAGE.write_text(text, encoding="utf-8")
+    PAGE.write_text(page(table, left), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,10 +1,11 @@
-"""The reference pages that come from the application itself: its commands, its settings, its tasks."""
+"""The reference pages that come from the application itself: its commands, settings, tasks and public API."""
 
 from __future__ import annotations
 
 import inspect
 import json
 import re
+import runpy
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ DATA = "measurements/data.md"  # outside the navigation; the page of results lea
 
 def pages() -> dict[str, str]:
     """Return path -> Markdown of every generated page."""
-    reference = {"commands": commands(), "settings": settings(), "tasks": tasks()}
+    reference = {"commands": commands(), "settings": settings(), "tasks": tasks(), "api": api()}
     return {f"reference/{name}.md": page for name, page in reference.items()} | {DATA: measured()}
 
 
@@ -37,6 +38,11 @@ def measured() -> str:
             tables = (TABLES[name](results) for name in ("provenance", "returns"))
             text += f"\n## {file.stem}\n\n" + "\n\n".join(table.markdown() for table in tables if table.rows) + "\n"
     return text
+
+
+def api() -> str:
+    """Return the page of the public API."""
+    return str(runpy.run_path(str(DOCS / "make_api.py"))["page"]())
 
 
 def commands() -> str:

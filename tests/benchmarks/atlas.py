@@ -139,11 +139,11 @@ def _line(row: dict[str, Any]) -> str:
     worst: dict[str, tuple[float, str, str]] = {}
     for element, fields in row.get("broken", {}).items():
         found = max(fields, key=lambda field: field["gap"])
-        share = "" if found["share"] is None else f", in {found['share']:.2%} of the states"
+        share = "" if found["share"] is None else f", {100 * found['share']:.3g}%"
         worst.setdefault(found["field"], (found["gap"], element, share))
         worst[found["field"]] = max(worst[found["field"]], (found["gap"], element, share))
     told = [row["reason"]] if "reason" in row else []
-    told += [f"{field} by {gap:.3g} s.d. ({element}{share})" for field, (gap, element, share) in worst.items()]
+    told += [f"{field} {gap:.3g} ({element}{share})" for field, (gap, element, share) in worst.items()]
     unseen = dict(row.get("not covered", {}))
     far = {name: unseen.pop(name) for name, found in list(unseen.items()) if _is_further_out(found)}
     for names, why in ((list(far), "only further out"), (list(unseen), "not covered")):
