@@ -15,7 +15,7 @@ from esp_cli.commands import options
 from esp_cli.commands.counts import chosen_seeds
 from esp_cli.console.progress import stop_requests
 from esp_cli.defaults import STEPS, PriorKind
-from esp_cli.networks.kernels.library import begin
+from esp_cli.networks.kernels.library import WORTH_COMPILING, begin
 from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
@@ -99,7 +99,9 @@ def train(
 ) -> None:
     """Train S seeds of one task, algorithm, network and prior at once, with live progress."""
     named = options.parse_assignments(settings or [])
-    if named.get("network.compiled"):
+    compiled = named.get("network.compiled", "auto")
+    is_worth_it = steps >= WORTH_COMPILING and resume is None and not print_config
+    if compiled is True or (compiled == "auto" and is_worth_it):
         begin("perceptron")  # while torch is imported
 
     from esp_cli import run as runs

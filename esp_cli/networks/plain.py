@@ -11,15 +11,12 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from esp_cli.networks.contract import VJP, ActivationName, IoSpec, Memoryless, Network, NetworkConfig
-from esp_cli.networks.kernels.library import has_compiler
+from esp_cli.networks.kernels.library import WORTH_COMPILING, has_compiler
 from esp_cli.networks.layers import GAINS, SeedLayerNorm, SeedLinear, SeedMLP
 from esp_cli.networks.ordering import NearestFirst
 from esp_cli.networks.perceptron import Shape, perceptron
 from esp_cli.networks.recurrent import SeedGRU
 from esp_envs.errors import UserError
-
-# steps per seed from which kernels save more than the seconds in which they are compiled, also with one seed
-WORTH_COMPILING = 100_000
 
 
 class CompiledConfig(NetworkConfig):
