@@ -25,6 +25,8 @@ SWING_RAD = 0.4
 """How far an action of 1 moves the target of a joint from where it stands."""
 HEIGHT_M = 0.302
 """Of the trunk, where the robot stands."""
+HIP_AHEAD_M, HIP_ASIDE_M, THIGH_ASIDE_M = 0.2, 0.09, 0.15
+"""Where hips and thighs hang, from the middle of the trunk."""
 LEGS = ("left_front", "right_front", "left_hind", "right_hind")
 AHEAD, LEFT = (1, 1, -1, -1), (1, -1, 1, -1)
 """Where each leg stands."""
@@ -151,8 +153,8 @@ class Quadruped(BatchedTask):
         # rad for each m/s of a foot, a fifth more than without slip
         reach = 1.2 * STEPS_OF_A_STRIDE * SUBSTEPS * TIMESTEP_S / 4 / HEIGHT_M * cos
         lift = 0.25 * (-sin).clamp_min(0)
-        hip = (vy + turning * 0.2 * ahead) * reach
-        thigh = ahead * lift - (vx - turning * 0.15 * left) * reach
+        hip = (vy + turning * HIP_AHEAD_M * ahead) * reach
+        thigh = ahead * lift - (vx - turning * THIGH_ASIDE_M * left) * reach
         target = torch.stack([hip, thigh, -2 * ahead * lift], -1) / SWING_RAD
         return target.flatten(-2).clamp(-1, 1).unsqueeze(-2)
 
@@ -235,11 +237,11 @@ def quadruped() -> str:
 
 def _leg(name: str, ahead: int, left: int) -> str:
     """Return the body of one leg, which stands with thigh and shin at 45 degrees."""
-    x, y = ahead * 0.2, left * 0.09
+    x, y, further = ahead * HIP_AHEAD_M, left * HIP_ASIDE_M, left * (THIGH_ASIDE_M - HIP_ASIDE_M)
     return f"""<body name="{name}_hip" pos="{x} {y} 0">
         <joint name="{name}_hip" axis="1 0 0" range="-45 45"/>
         <geom type="sphere" size=".04" mass=".4"/>
-        <body name="{name}_thigh" pos="0 {left * 0.06} 0">
+        <body name="{name}_thigh" pos="0 {further} 0">
             <joint name="{name}_thigh" axis="0 1 0" range="-60 60"/>
             <geom type="capsule" size=".02" fromto="0 0 0 {-ahead * 0.14} 0 -.14" mass=".5"/>
             <body name="{name}_shin" pos="{-ahead * 0.14} 0 -.14">
