@@ -28,6 +28,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from esp_cli.algorithms.learner import Learner
 from esp_cli.algorithms.mappo import Mappo
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
@@ -103,9 +104,10 @@ def matrix_rate(seeds: int, rows: int, precision: str, device: str, repeats: int
     return 2.0 * seeds * rows * 64 * 64 / min(times)
 
 
-def measure(name: str, seeds: int, iterations: int, device: str) -> dict[str, object]:
-    """Time `iterations` iterations of one case."""
-    algorithm, overrides = CASES[name]
+def timed(
+    algorithm: str, overrides: dict[str, object], seeds: int, iterations: int, device: str
+) -> tuple[Learner, list[float]]:
+    """Return a learner of navigation and its seed-steps a second in each of `iterations` iterations."""
     config = resolve_config("navigation", algorithm, seeds=range(seeds), overrides=overrides, device=device)
     learner = build_learner(config)
     for _ in range(WARM_UP):
@@ -115,7 +117,13 @@ def measure(name: str, seeds: int, iterations: int, device: str) -> dict[str, ob
         begin = time.perf_counter()
         learner.iterate(0.0).finite.tolist()  # until a GPU has computed it
         times.append(time.perf_counter() - begin)
-    rates = [seeds * learner.steps_per_iteration / seconds for seconds in times]
+    return learner, [seeds * learner.steps_per_iteration / seconds for seconds in times]
+
+
+def measure(name: str, seeds: int, iterations: int, device: str) -> dict[str, object]:
+    """Time `iterations` iterations of one case."""
+    algorithm, overrides = CASES[name]
+    learner, rates = timed(algorithm, overrides, seeds, iterations, device)
     record: dict[str, object] = {
         "case": name,
         "seeds": seeds,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import os
 import shlex
@@ -24,6 +25,8 @@ PADDING = 16  # PAD of vectors.h
 WORTH_COMPILING = 100_000
 """Steps per seed from which kernels save more than the seconds in which they are compiled, also with one seed."""
 
+_folders: set[str] = set()  # of kernels that were begun and are not loaded
+
 
 def padded(width: int) -> int:
     """Return a width filled up to a multiple of PADDING."""
@@ -44,8 +47,11 @@ def computes(compiled: bool, x: Tensor) -> bool:
 def library(name: str) -> ctypes.CDLL:
     """Load a kernel, which takes up to a second to compile where nothing began it before."""
     try:
-        with begin(name).result() as folder:
-            return ctypes.CDLL(str(Path(folder) / name))  # after torch, whose OpenMP it takes
+        folder = begin(name).result()
+        try:
+            return ctypes.CDLL(f"{folder}/{name}")  # after torch, whose OpenMP it takes
+        finally:
+            _remove(folder)
     except (ValueError, OSError) as error:
         begin.cache_clear()  # so that it may be tried again
         if isinstance(error, ValueError):
@@ -57,7 +63,7 @@ def library(name: str) -> ctypes.CDLL:
 
 
 @cache
-def begin(name: str) -> Future[tempfile.TemporaryDirectory[str]]:
+def begin(name: str) -> Future[str]:
     """Begin to compile a kernel, beside whatever else there is to do, in a temporary folder."""
     workers = ThreadPoolExecutor(1)
     compiling = workers.submit(_compile, name)
@@ -82,23 +88,42 @@ def _compiler() -> list[str]:
     return named or [next(filter(shutil.which, ("c++", "g++", "clang++")), "")]
 
 
-def _compile(name: str) -> tempfile.TemporaryDirectory[str]:
+def _compile(name: str) -> str:
     compiler = _compiler()
     if shutil.which(compiler[0]) is None:
         raise UserError("network.compiled needs a C++ compiler; install one (g++ or clang++), or leave it off")
-    folder = tempfile.TemporaryDirectory()
-    built, log = Path(folder.name) / name, Path(folder.name) / "log"
+    folder = tempfile.mkdtemp()
+    _folders.add(folder)
+    built, log = Path(folder) / name, Path(folder) / "log"
     command = [*compiler, *_OPTIONS, str(Path(__file__).with_name(f"{name}.cpp")), "-o", str(built)]
     with log.open("wb") as said:  # not a pipe, which a process forked meanwhile would hold open
         failed = subprocess.run(command, check=False, stderr=said).returncode
     if failed:
         lines = log.read_text(errors="replace").strip().splitlines() or ["it says nothing"]
         line = next((line for line in lines if "error" in line), lines[-1])
+        _remove(folder)
         raise UserError(f"{compiler[0]} does not compile the kernels of network.compiled: {line}")
     return folder
 
 
-os.register_at_fork(after_in_child=begin.cache_clear)  # a forked process has no thread that would end what was begun
+def _remove(folder: str) -> None:
+    _folders.discard(folder)
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+@atexit.register
+def _remove_all() -> None:
+    for folder in list(_folders):
+        _remove(folder)
+
+
+def _forget() -> None:
+    """Leave what a parent process began to the parent: its thread would never end it here, and its folders stay."""
+    begin.cache_clear()
+    _folders.clear()
+
+
+os.register_at_fork(after_in_child=_forget)
 
 
 def call(kernel: str, function: str, *arguments: ctypes.Structure | ctypes.Array[Any] | Tensor | None) -> None:

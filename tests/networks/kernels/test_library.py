@@ -112,6 +112,21 @@ def test_a_forked_process_compiles_for_itself(tmp_path, monkeypatch):
     library.begin.cache_clear()
 
 
+@needs_compiler
+def test_a_forked_process_leaves_what_its_parent_compiled():
+    library.library.cache_clear()
+    library.begin.cache_clear()
+    folder = Path(library.begin("mixer").result())
+    child = os.fork()
+    if child == 0:
+        library._remove_all()  # as at its exit
+        os._exit(library.begin.cache_info().currsize)
+    assert os.waitpid(child, 0)[1] == 0
+    assert (folder / "mixer").is_file()
+    assert library.library("mixer")
+    assert not folder.exists()
+
+
 def test_bfloat16_and_the_kernel_exclude_each_other():
     with pytest.raises(ValueError, match="compiled perceptrons compute in float32"):
         MlpConfig(compiled=True, precision="bfloat16")
