@@ -75,6 +75,7 @@ def drawn(found: dict[str, dict[str, float]]) -> Figure:
         axes.set(title=title, ylabel="agent-steps/s" if title == "agents" else "seed-steps/s", ylim=(0, None))
         axes.yaxis.set_major_formatter(EngFormatter(sep=""))
         axes.grid(color="#E5E5E5")
+        axes.set_axisbelow(True)
         axes.spines[["top", "right"]].set_visible(False)
     return figure
 
