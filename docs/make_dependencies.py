@@ -22,7 +22,7 @@ _BEGIN = """# Dependencies
 
 This is what `pip install .` in a checkout brings on Linux with Python 3.11, at the versions of
 [constraints.txt](../constraints.txt), and when each release was uploaded. The parts of CUDA that `torch` may bring are
-left out, since the tests do not install them. `docs/make_dependencies.py` writes this page; its first lines say how.
+left out, since the tests do not install them. `docs/make_dependencies.py` writes this page.
 
 `pip-audit -r constraints.txt` compares these versions with the database of known vulnerabilities. The project's own
 checks run where this database cannot be reached. This page does not say that a version has no vulnerability.

@@ -44,7 +44,7 @@ def rows(package: str, root: Path) -> Iterator[list[str] | None]:
             yield None
             continue
         name = path.relative_to(root).as_posix().removeprefix("envs/").replace("/assets/", "/")
-        cells = [f"{package} {name}", str(len(body.joints))]
+        cells = [f"{package}/{name}", str(len(body.joints))]
         if body.found:
             proof = next(iter(body.found.values())).proof
             yield [*cells, body.group, proof.verdict, f"{proof.gap:.1g}", f"{proof.planted.min():.2g}"]

@@ -120,7 +120,7 @@ def _task_of(row: dict[str, Any]) -> str:
 def page(rows: list[dict[str, Any]]) -> str:
     """Return the page."""
     text = Path(__file__).with_name("atlas_page.md").read_text()
-    lines = ["| task | found | what breaks the others | decided by |", "|---|---|---|---|"]
+    lines = ["| task | found | what breaks the others |", "|---|---|---|"]
     order = {(package, name): k for k, (package, name, *_) in enumerate(tasks())}
     rows = sorted(rows, key=lambda row: order.get((row["package"], _task_of(row)), len(order)))
     lines += [_line(row) for row in rows if "found" in row]
@@ -149,7 +149,8 @@ def _line(row: dict[str, Any]) -> str:
     for names, why in ((list(far), "only further out"), (list(unseen), "not covered")):
         told += [f"{why}: {', '.join(names[:3])}" + (" and more" if len(names) > 3 else "")] if names else []
     group = row["found"].replace(" and ", "` and `")  # code does not wrap
-    return f"| {row['package']} {row['task']} | `{group}` | {'; '.join(told[:3]) or '-'} | {row['method']} |"
+    how = "" if row["method"] == "paired states" else f" ({row['method']})"
+    return f"| {row['package']}/{row['task']} | `{group}`{how} | {'; '.join(told[:3]) or '-'} |"
 
 
 def main() -> None:
