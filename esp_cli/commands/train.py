@@ -100,7 +100,7 @@ def train(
     """Train S seeds of one task, algorithm, network and prior at once, with live progress."""
     named = options.parse_assignments(settings or [])
     compiled = named.get("network.compiled", "auto")
-    is_worth_it = steps >= WORTH_COMPILING and resume is None and not print_config
+    is_worth_it = steps >= WORTH_COMPILING and device != "cuda" and resume is None and not print_config
     if compiled is True or (compiled == "auto" and is_worth_it):
         begin("perceptron")  # while torch is imported
 
