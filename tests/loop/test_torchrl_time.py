@@ -15,7 +15,7 @@ pytest.importorskip("gymnasium", reason="needs Gymnasium")
 
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
-from torchrl.collectors import SyncDataCollector
+from torchrl.collectors import Collector
 from torchrl.collectors.utils import split_trajectories
 from torchrl.data import LazyTensorStorage, MultiStep, ReplayBuffer
 from torchrl.data.replay_buffers.samplers import SliceSampler
@@ -40,7 +40,7 @@ def collected(num_envs: int = 1) -> TensorDict:
     """Return what a collector delivers of random actions: [64], or [E, 64 / E]."""
     torch.manual_seed(0)
     env: Any = GymEnv("Pendulum-v1") if num_envs == 1 else SerialEnv(num_envs, lambda: GymEnv("Pendulum-v1"))
-    collector = SyncDataCollector(env, None, frames_per_batch=FRAMES, total_frames=FRAMES)
+    collector = Collector(env, None, frames_per_batch=FRAMES, total_frames=FRAMES)
     (data,) = (batch.clone() for batch in collector)
     collector.shutdown()
     return data
@@ -78,7 +78,7 @@ def test_advantages_of_originals_are_those_without_copies(kind, num_envs) -> Non
 def test_a_real_collector_takes_them_as_its_postproc() -> None:
     torch.manual_seed(0)
     env, copies = GymEnv("Pendulum-v1"), SymmetricCopies(mirrored())
-    collector = SyncDataCollector(env, None, frames_per_batch=FRAMES, total_frames=FRAMES, postproc=copies)
+    collector = Collector(env, None, frames_per_batch=FRAMES, total_frames=FRAMES, postproc=copies)
     (both,) = (batch.clone() for batch in collector)
     collector.shutdown()
     assert both.shape == (2, FRAMES)
