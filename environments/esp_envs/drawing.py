@@ -106,8 +106,8 @@ class _Canvas:
 
     def grid(self, spacing: float, offset: float) -> None:
         x_min, x_max, y_min, y_max = self._window
-        lines = [((x, y_min), (x, y_max)) for x in _lines(x_min, x_max, spacing, offset)]
-        for line in (*lines, *(((x_min, y), (x_max, y)) for y in _lines(y_min, y_max, spacing, offset))):
+        lines = [((x, y_min), (x, y_max)) for x in grid_lines(x_min, x_max, spacing, offset)]
+        for line in (*lines, *(((x_min, y), (x_max, y)) for y in grid_lines(y_min, y_max, spacing, offset))):
             self._line(line, GRID, _OVERSAMPLING)
         width, height = self._image.size
         self._draw.rectangle((0, 0, width - 1, height - 1), outline=FRAME, width=_OVERSAMPLING)
@@ -175,8 +175,9 @@ class _Canvas:
         return (point[0] - self._window[0]) * self._scale, (self._window[3] - point[1]) * self._scale
 
 
-def _lines(low: float, high: float, spacing: float, offset: float) -> list[float]:
-    first, last = math.ceil((low - offset) / spacing), math.floor((high - offset) / spacing)
+def grid_lines(low: float, high: float, spacing: float, offset: float = 0.0) -> list[float]:
+    """Return where lines of a grid lie between two bounds, one of them at an offset."""
+    first, last = math.ceil((low - offset) / spacing - 1e-9), math.floor((high - offset) / spacing + 1e-9)
     return [k * spacing + offset for k in range(first, last + 1)]
 
 

@@ -146,6 +146,13 @@ def import_named(name: str, noun: str, kind: str, example: str) -> Any:
     return getattr(module, attribute)
 
 
+def import_function(name: str) -> Any:
+    """Import what a user named as "module:function"."""
+    if callable(found := import_named(name, "function", "function", "my_robot:mirror")):
+        return found
+    raise UserError(f"'{name}' is no function; check the name after the colon")
+
+
 def entries(group: str) -> list[EntryPoint]:
     """Return what packages install, and those that are `FURTHER`; none is imported."""
     added = FURTHER.get(group, {}).items()

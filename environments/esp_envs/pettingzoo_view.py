@@ -8,6 +8,7 @@ Needs the optional extra `pettingzoo` of this package.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -136,23 +137,16 @@ class ParallelView(ParallelEnv):  # type: ignore[misc]  # pettingzoo may be miss
         return torch.as_tensor(joint).unsqueeze(0).unsqueeze(0)
 
     def _checked(self, agent: str, action: object) -> _Array:
-        """Return an agent's action as an integer or a float32 vector; any NumPy or Python numbers are taken."""
-        space = self._env.spec.action
-        try:
+        """Return an agent's action in the type of its space; any NumPy or Python numbers are taken."""
+        space = self.action_spaces[agent]
+        array: _Array = np.empty(0, object)
+        with suppress(ValueError):  # rows of different lengths
             array = np.asarray(action)
-        except ValueError:  # rows of different lengths
-            array = np.empty(0, object)
-        shape = (space.width,) if isinstance(space, Continuous) else ()
-        if array.shape != shape and not (shape == () and array.shape == (1,)):
-            wanted = f"an array of shape {shape}" if shape else "one integer"
-            raise UserError(f"{agent}'s action has shape {array.shape}; give {wanted}")
-        if isinstance(space, Continuous):
-            if array.dtype.kind not in "fiu" or not ((array >= -1) & (array <= 1)).all():  # false for NaN too
-                raise UserError(f"{agent}'s action {action!r} is not within -1 and 1; give numbers from there")
-            return array.astype(np.float32)
-        if array.dtype.kind not in "iu" or not 0 <= int(array.reshape(())) < space.count:
-            raise UserError(f"{agent}'s action {action!r} is not an integer from 0 to {space.count - 1}")
-        return array.reshape(()).astype(np.int64)
+        array = array.reshape(()) if array.shape == (1,) and not space.shape else array
+        is_number = array.dtype.kind in ("fiu" if space.shape else "iu")
+        if not is_number or array.shape != space.shape or not space.contains(array.astype(space.dtype)):
+            raise UserError(f"{agent}'s action {action!r} is not in {space}; give one from there")
+        return array.astype(space.dtype)
 
     def _take(
         self, seen: Observation, metrics: dict[str, float]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from pydantic import BaseModel, ConfigDict
@@ -24,17 +23,6 @@ class Breaks:
 
     plane: str | None
     agents: bool = True
-
-
-def remaining(whole: str, broken: Iterable[Breaks]) -> str:
-    """Return the symmetry that is left where several things break it: "flip-x*agents", "c1" for none."""
-    real = list(broken)
-    planes = {one.plane for one in real if one.plane is not None}
-    plane, *rest = whole.split("*")
-    if planes:
-        plane = planes.pop() if len(planes) == 1 else "c1"
-    exchanged = all(one.agents for one in real)
-    return "*".join((plane, *(factor for factor in rest if factor != "agents" or exchanged)))
 
 
 class TaskSettings(BaseModel):
@@ -62,8 +50,14 @@ class TaskSettings(BaseModel):
         return {name: replace(mark, plane=getattr(self, f"{mark.plane}", mark.plane)) for name, mark in marks.items()}
 
     def left_of(self, whole: str, *further: Breaks) -> str:
-        """Return what the settings, and further things, leave of a symmetry: "flip-x*agents"."""
-        return remaining(whole, (*self.broken().values(), *further))
+        """Return what the settings, and further things, leave of a symmetry: "flip-x*agents", "c1" for none."""
+        broken = (*self.broken().values(), *further)
+        planes = {one.plane for one in broken if one.plane is not None}
+        plane, *rest = whole.split("*")
+        if planes:
+            plane = planes.pop() if len(planes) == 1 else "c1"
+        exchanged = all(one.agents for one in broken)
+        return "*".join((plane, *(factor for factor in rest if factor != "agents" or exchanged)))
 
     def broken_in_words(self) -> str:
         """Return what a reward convention adds about the settings that break a symmetry: ", wind 0.3"."""

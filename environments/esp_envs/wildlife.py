@@ -287,14 +287,7 @@ def all_pictures(width: int, height: int) -> Tensor:
 
     It shows the whole torus with the drone in the middle. A poacher below the drone hides it.
     """
-    pictures = torch.zeros(height, width, PIXELS * height, PIXELS * width)
-    _stamp(pictures, height // 2, width // 2, _DRONE)
-    for row in range(height):
-        for column in range(width):
-            _stamp(pictures[row, column], row, column, _POACHER)
-    return pictures.flatten(2).flatten(0, 1)
-
-
-def _stamp(picture: Tensor, row: int, column: int, stamp: tuple[tuple[float, ...], ...]) -> None:
-    y, x = PIXELS * row, PIXELS * column
-    picture[..., y : y + PIXELS, x : x + PIXELS] = torch.tensor(stamp)
+    cells = torch.eye(width * height).view(-1, height, width)
+    pictures, middle = torch.kron(cells, torch.tensor([_POACHER])), len(cells) // 2
+    pictures[torch.arange(len(cells)) != middle] += torch.kron(cells[middle], torch.tensor(_DRONE))
+    return pictures.flatten(1)

@@ -20,11 +20,11 @@ from esp_cli.networks.policy import Policy
 from esp_cli.prior.config import PriorConfig
 from esp_cli.training.config import RunConfig
 from esp_envs.base import Environment, Observation
-from esp_envs.compass import Compass
 from esp_envs.conformance import QUICK, Subject, check
 from esp_envs.errors import UserError
 from esp_envs.registry import TASKS, make
 from esp_envs.spec import TaskSpec
+from esp_envs.views import Compass
 
 
 def stream_seed(seed: int, *names: object) -> int:

@@ -27,7 +27,6 @@ from rich.table import Table
 
 from esp_envs import make
 from esp_envs.epuck.engines import ENGINES, make_physics
-from esp_envs.epuck.physics import Bodies
 from esp_envs.epuck.robot import MAX_WHEEL_SPEED, Arena
 
 ARENA = Arena(side_m=2.0, num_robots=8, num_pillars=2, pillar_radius_m=0.1)
@@ -41,20 +40,20 @@ def of_physics(engine: str, worlds: int, threads: int) -> Callable[[], object]:
     robots = (worlds, ARENA.num_robots)
     wheels = MAX_WHEEL_SPEED * rng.uniform(-1, 1, (EPISODE, *robots, 2))
     heading = rng.uniform(-np.pi, np.pi, (*robots, 1))
-    start = Bodies(
-        pose=np.concatenate([np.tile(ARENA.posts(), (worlds, 1, 1)), heading], -1),
-        velocity=np.zeros((*robots, 3)),
-        pillars=np.tile(ARENA.pillars(), (worlds, 1, 1)),
-        mass=np.ones(robots),
-        friction=np.ones(robots),
-    )
+    start = {
+        "pose": np.concatenate([np.tile(ARENA.posts(), (worlds, 1, 1)), heading], -1),
+        "velocity": np.zeros((*robots, 3)),
+        "pillars": np.tile(ARENA.pillars(), (worlds, 1, 1)),
+        "mass": np.ones(robots),
+        "friction": np.ones(robots),
+    }
     physics = make_physics(engine, ARENA, worlds, PERIOD_S, threads)
     steps = itertools.cycle(range(EPISODE))
 
     def step() -> None:
         index = next(steps)
         if index == 0:
-            physics.place(start)
+            physics.place(**start)
         physics.advance(wheels[index])
 
     return step

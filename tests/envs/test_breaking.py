@@ -13,7 +13,7 @@ from esp_cli.symmetry import Group
 from esp_cli.symmetry.admission import admitted_elements
 from esp_envs import Environment, Step, make
 from esp_envs.epuck.robot import MAX_WHEEL_SPEED
-from esp_envs.settings import Breaks, remaining
+from esp_envs.settings import Breaks, TaskSettings
 from esp_envs.spec import Spaces
 from tests.envs.test_frozen_prey import write
 
@@ -76,11 +76,12 @@ def test_a_learned_prey_leaves_nothing_that_is_declared(tmp_path: Path, prey) ->
 
 def test_what_several_breakings_leave() -> None:
     wind, mud, gust, weak = Breaks("flip-x"), Breaks("flip-x"), Breaks("flip-diagonal"), Breaks(None, agents=False)
-    assert remaining("d4*agents", []) == "d4*agents"
-    assert remaining("o2*agents", [wind, mud]) == "flip-x*agents"
-    assert remaining("d4*agents", [wind, gust, weak]) == "c1"
-    assert remaining("d4*agents*landmarks-3", [wind, weak]) == "flip-x*landmarks-3"
-    assert remaining("d4", [weak]) == "d4"
+    left_of = TaskSettings().left_of
+    assert left_of("d4*agents") == "d4*agents"
+    assert left_of("o2*agents", wind, mud) == "flip-x*agents"
+    assert left_of("d4*agents", wind, gust, weak) == "c1"
+    assert left_of("d4*agents*landmarks-3", wind, weak) == "flip-x*landmarks-3"
+    assert left_of("d4", weak) == "d4"
     settings = make("navigation", 1, [0], {"wind": 1, "action_turn_rad": 0.5, "actions": "continuous"}).settings
     assert settings.broken() == {"wind": wind, "action_turn_rad": Breaks("so2")}, "those that are 0 break nothing"
     assert settings.broken_in_words() == ", wind 1, action_turn_rad 0.5"

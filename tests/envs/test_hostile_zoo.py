@@ -416,7 +416,7 @@ SINGLE = {
     ),
     "reset twice": (
         single(reset=lambda self, seed=None: (1.0, 2.0)),
-        "'reset' returns a tuple; return .obs",
+        "'reset' returns 2 parts; return .obs",
     ),
     "no seed": (single(reset=lambda self: (np.zeros(2), {})), "'reset' takes no seed"),
     "old step": (

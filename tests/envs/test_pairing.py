@@ -358,7 +358,5 @@ def test_unlike_agents_are_refused_with_what_to_do() -> None:
         def reading(self, agent, observation):
             return np.repeat(observation, 2 if agent == "agent_1" else 1)
 
-    with pytest.raises(
-        ValueError, match=r"agent_0 sees 1 numbers .* agent_1 sees 2 .* must be alike; begin 'learners'"
-    ):
+    with pytest.raises(ValueError, match=r"agent_1 sees 2 numbers, but the layout has 1; .* begin 'learners'"):
         Unlike(Unlike.Settings(), 1, generators_for([0]))

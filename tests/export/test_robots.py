@@ -17,7 +17,6 @@ from esp_cli.export.export import export
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training.build import build_environment
 from esp_envs.epuck.engines import make_physics
-from esp_envs.epuck.physics import Bodies
 from esp_envs.epuck.robot import MAX_WHEEL_SPEED, drive
 from tests.export.policies import drawn_policy
 
@@ -39,7 +38,7 @@ class Team:
         self.pillars = self.env._pillars
         self.physics = make_physics(settings.physics, settings.arena, 1, settings.control_period_s)
         ones = np.ones(robots)
-        self.physics.place(Bodies(pose, np.zeros_like(pose), self.pillars, ones, ones))
+        self.physics.place(pose, np.zeros_like(pose), self.pillars, ones, ones)
         self.goals = self.env._goals[0]
 
     @property

@@ -22,8 +22,8 @@ from esp_cli.training.checkpoint import read_policy
 from esp_cli.training.config import RunConfig, resolve_config
 from esp_cli.training.run_folder import RunFolder
 from esp_envs import make
-from esp_envs.compass import Compass, framed
 from esp_envs.spec import joint_layout
+from esp_envs.views import Compass, framed
 from tests.cli.running import esp, refused
 from tests.learning.golden import digest
 from tests.prior.test_copies import SPACES, Squared, rows

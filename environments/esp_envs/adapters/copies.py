@@ -1,12 +1,13 @@
 """Many copies of one environment, stepped here or in worker processes, with all numbers in shared memory.
 
-A `Board` holds what goes to and comes from every copy; a `Stepper` steps some copies and knows nothing of processes.
+A `Board` holds what goes to and comes from every copy; a `CopyStepper` steps some copies, in any process.
 One stepper steps all copies here, or `WorkerCopies` shares them out among many, with the same results bit for bit.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
 import mmap
 import multiprocessing
 import os
@@ -14,10 +15,9 @@ import signal
 import warnings
 import weakref
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkProcess
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,29 +25,15 @@ from numpy.typing import NDArray
 
 from esp_envs.errors import UserError
 from esp_envs.installed import last_line
+from esp_envs.spec import Discrete, TaskSpec
 
-_RESET, _STEP, _PLACE, _LEAVE = b"reset", b"step", b"place", b"leave"
+_LEAVE = b"leave"
 TERMINATED, TRUNCATED = 1, 2  # what `Board.ended` says of a copy whose episode ended in this step
 NOW, FINAL = 0, 1  # where a board holds what is seen now, and what was seen before an automatic reset
 
 
-@dataclass(frozen=True)
-class Sizes:
-    """How large the arrays of a board are: C copies, N agents, and the widths of their numbers."""
-
-    copies: int
-    agents: int
-    obs: int
-    state: int
-    metrics: int
-    action: int | None
-    """Width of a continuous action; None for a discrete one."""
-    choices: int = 0
-    """Discrete actions of a mask; 0 without masks."""
-
-
 class Board:
-    """Arrays over one piece of memory, which a fork of this process shares.
+    """Arrays of C copies of a task and M metrics, in memory that a fork of this process shares.
 
     Attributes:
         cut: [C] uint8, which copies reach the horizon with the next step.
@@ -63,69 +49,44 @@ class Board:
         alive: [2, C, N] uint8, the agents that have not ended.
     """
 
-    cut: NDArray[np.uint8]
-    ended: NDArray[np.uint8]
-    seed: NDArray[np.int64]
-    action: NDArray[Any]
-    reward: NDArray[np.float32]
-    metrics: NDArray[np.float32]
-    obs: NDArray[np.float32]
-    state: NDArray[np.float32]
-    mask: NDArray[np.uint8]
-    alive: NDArray[np.uint8]
-
-    def __init__(self, sizes: Sizes) -> None:
-        copies, agents = sizes.copies, sizes.agents
-        action = ((copies, agents), np.int64) if sizes.action is None else ((copies, agents, sizes.action), np.float32)
-        # the widest numbers first, so that each array begins at a multiple of its number's width
-        parts: dict[str, tuple[tuple[int, ...], type[np.generic]]] = {
-            "seed": ((copies,), np.int64),
-            "action": action,
-            "reward": ((copies, agents), np.float32),
-            "metrics": ((copies, sizes.metrics), np.float32),
-            "obs": ((2, copies, agents, sizes.obs), np.float32),
-            "state": ((2, copies, sizes.state), np.float32),
-            "mask": ((2, copies, agents, sizes.choices), np.uint8),
-            "alive": ((2, copies, agents), np.uint8),
-            "cut": ((copies,), np.uint8),
-            "ended": ((copies,), np.uint8),
-        }
-        memory = mmap.mmap(-1, sum(int(np.prod(shape)) * np.dtype(kind).itemsize for shape, kind in parts.values()))
-        start = 0
-        for name, (shape, kind) in parts.items():
-            array = np.frombuffer(memory, kind, int(np.prod(shape)), start).reshape(shape)
-            setattr(self, name, array)
-            start += array.nbytes
+    def __init__(self, spec: TaskSpec, copies: int, metrics: int) -> None:
+        team, action, choices = (copies, spec.num_agents), spec.action, 0
+        if isinstance(action, Discrete):
+            self.action, choices = _shared(np.int64, *team), action.count if spec.masks else 0
+        else:
+            self.action = _shared(np.float32, *team, action.width)
+        self.cut, self.ended = _shared(np.uint8, copies), _shared(np.uint8, copies)
+        self.seed = _shared(np.int64, copies)
+        self.reward, self.metrics = _shared(np.float32, *team), _shared(np.float32, copies, metrics)
+        self.obs = _shared(np.float32, 2, *team, spec.observation.width)
+        self.state = _shared(np.float32, 2, copies, spec.state.width)
+        self.mask = _shared(np.uint8, 2, *team, choices)
+        self.alive = _shared(np.uint8, 2, *team)
 
 
-class Stepper(Protocol):
-    """What resets and steps the copies of a board."""
+def _shared(kind: type[np.generic], *shape: int) -> NDArray[Any]:
+    """Return zeros in memory that a fork shares."""
+    count = math.prod(shape)
+    return np.frombuffer(mmap.mmap(-1, max(1, count) * np.dtype(kind).itemsize), kind, count).reshape(shape)
 
-    board: Board
 
-    def reset(self) -> None:
-        """Start an episode in every copy."""
-
-    def step(self) -> None:
-        """Advance every copy by one step, and reset those whose episode ends."""
-
-    def place(self) -> None:
-        """Put every copy, which has just been reset, into the state on the board."""
+MakeStepper = Callable[[Board, range], Any]
+"""Makes what can `reset`, `step` and `place` some copies of a board, as a `CopyStepper`."""
 
 
 class WorkerCopies:
     """The copies shared out among worker processes, which are forks of this one.
 
-    A command is one byte in a pipe; its answer is empty, or the sentence of what went wrong. A worker leaves when its
-    pipe closes, so none outlives this process.
+    A command is the name of a stepper's method in a pipe; its answer is empty, or the sentence of what went wrong. A
+    worker leaves when its pipe closes, so none outlives this process.
     """
 
-    def __init__(self, sizes: Sizes, make_stepper: Callable[[Board, range], Stepper], count: int) -> None:
-        self.board = Board(sizes)
+    def __init__(self, board: Board, make_stepper: MakeStepper, count: int) -> None:
+        self.board, copies = board, len(board.seed)
         context = multiprocessing.get_context("fork")
         self._workers: list[tuple[Connection, ForkProcess]] = []
         for k in range(count):
-            share = range(sizes.copies * k // count, sizes.copies * (k + 1) // count)
+            share = range(copies * k // count, copies * (k + 1) // count)
             here, there = context.Pipe()
             ends = [here, *(pipe for pipe, _ in self._workers)]
             worker = context.Process(target=_work, args=(there, ends, make_stepper, self.board, share), daemon=True)
@@ -138,14 +99,13 @@ class WorkerCopies:
         self._wait()
 
     def reset(self) -> None:
-        self._command(_RESET)
+        self._command(b"reset")
 
     def step(self) -> None:
-        self._command(_STEP)
+        self._command(b"step")
 
     def place(self) -> None:
-        """Put every copy, which has just been reset, into the state on the board."""
-        self._command(_PLACE)
+        self._command(b"place")
 
     def _command(self, word: bytes) -> None:
         for pipe, _ in self._workers:
@@ -158,11 +118,6 @@ class WorkerCopies:
         failures = [failure for pipe, worker in self._workers if (failure := _answer(pipe, worker))]
         if failures:
             raise UserError(failures[0])
-
-
-def can_fork() -> bool:
-    """Return whether this machine can fork processes."""
-    return "fork" in multiprocessing.get_all_start_methods()
 
 
 def _answer(pipe: Connection, worker: ForkProcess) -> str:
@@ -179,7 +134,7 @@ def _answer(pipe: Connection, worker: ForkProcess) -> str:
 def _work(
     pipe: Connection,
     ends_of_the_parent: Sequence[Connection],
-    make_stepper: Callable[[Board, range], Stepper],
+    make_stepper: MakeStepper,
     board: Board,
     share: range,
 ) -> None:
@@ -189,19 +144,13 @@ def _work(
         end.close()
     os.dup2(2, 1)  # an environment may print, and the command's output stays clean
     torch.set_num_threads(1)
-    stepper: Stepper | None = None
-
-    def begin() -> None:
-        nonlocal stepper
-        stepper = make_stepper(board, share)
-
-    pipe.send_bytes(_failure_of(begin))
-    if stepper is None:
+    steppers: list[Any] = []
+    pipe.send_bytes(_failure_of(lambda: steppers.append(make_stepper(board, share))))
+    if not steppers:
         return
-    commands = {_RESET: stepper.reset, _STEP: stepper.step, _PLACE: stepper.place}
     with contextlib.suppress(EOFError, ConnectionError):
         while (word := pipe.recv_bytes()) != _LEAVE:
-            pipe.send_bytes(_failure_of(commands[word]))
+            pipe.send_bytes(_failure_of(getattr(steppers[0], word.decode())))
 
 
 def _failure_of(command: Callable[[], None]) -> bytes:

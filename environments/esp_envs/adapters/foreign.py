@@ -55,35 +55,47 @@ def _kind(env: Any, wanted: str) -> str:
     return f"a {type(env).__name__}, which has no '{missing if methods else 'reset and step'}'"
 
 
-def by_agent(env: Any) -> Any:
-    """Return an environment whose agents are entries of Tuple spaces and of lists as one with agents by name."""
-    spaces = getattr(getattr(env, "action_space", None), "spaces", None)
-    return env if not isinstance(spaces, Sequence) or hasattr(env, "possible_agents") else _Listed(env, spaces)
+class ByAgent:
+    """A Gymnasium environment as a PettingZoo `ParallelEnv`, as far as the adapter needs one.
 
+    Its agents are entries of Tuple spaces and of lists, as in level-based foraging: "agent_0", "agent_1" and so on. One
+    that is `alone` is called "agent".
+    """
 
-class _Listed:
-    """A Gymnasium environment of several agents, as in level-based foraging: "agent_0", "agent_1" and so on."""
+    def __init__(self, env: Any, alone: bool = True) -> None:
+        self.own, self._alone = env, alone
+        spaces = [env.action_space] if alone else env.action_space.spaces
+        self.possible_agents = self.agents = ["agent"] if alone else [f"agent_{k}" for k in range(len(spaces))]
+        self._spaces = dict(zip(self.agents, spaces, strict=True))
 
-    def __init__(self, env: Any, spaces: Sequence[Any]) -> None:
-        self.unwrapped, self._env = getattr(env, "unwrapped", env), env
-        self.possible_agents = [f"agent_{k}" for k in range(len(spaces))]
-        self.action_spaces = dict(zip(self.possible_agents, spaces, strict=True))
+    def __getattr__(self, name: str) -> Any:
+        """Give `state`, `unwrapped` and all else of the environment."""
+        if name == "own":  # not there while it is unpacked
+            raise AttributeError(name)
+        return getattr(self.own, name)
+
+    def action_space(self, agent: str) -> Any:
+        return self._spaces[agent]
 
     def reset(self, seed: int) -> tuple[Mapping[Any, Any], ...]:
-        seen, infos = self._env.reset(seed=seed)
-        return self._named(seen), self._named(infos)
+        return self._named(self.own.reset(seed=seed), "reset", "observation", "info")
 
     def step(self, actions: Mapping[Any, Any]) -> tuple[Mapping[Any, Any], ...]:
-        return tuple(map(self._named, self._env.step([actions[name] for name in self.possible_agents])))
+        given = [actions[name] for name in self.agents]
+        result = self.own.step(given[0] if self._alone else given)
+        return self._named(result, "step", "observation", "reward", "terminated", "truncated", "info")
 
-    def close(self) -> None:
-        self._env.close()
-
-    def _named(self, part: Any) -> dict[str, Any]:
+    def _named(self, given: Any, method: str, *parts: str) -> tuple[Mapping[Any, Any], ...]:
         """Return what each agent gets; one number, flag or info is for all."""
-        is_one = isinstance(part, Mapping) or (not isinstance(part, tuple | list) and np.ndim(part) == 0)
-        each = [part] * len(self.possible_agents) if is_one else part
-        return dict(zip(self.possible_agents, each, strict=True))
+        complete = isinstance(given, tuple) and len(given) == len(parts)
+        if not complete or not isinstance(given[-1], Mapping | list | tuple):
+            shown = f"{len(given)} parts" if isinstance(given, tuple) else f"a {type(given).__name__}"
+            raise UserError(f"'{method}' returns {shown}; return ({', '.join(parts)}), as Gymnasium does")
+        if self._alone:
+            return tuple({"agent": part} for part in given)
+        is_one = [isinstance(x, Mapping) or (not isinstance(x, tuple | list) and np.ndim(x) == 0) for x in given]
+        each = ([x] * len(self.agents) if one else x for x, one in zip(given, is_one, strict=True))
+        return tuple(dict(zip(self.agents, part, strict=True)) for part in each)
 
 
 def space_of(env: Any, agent: Any) -> Any:
@@ -110,16 +122,14 @@ def reset(env: Any, seed: int) -> Any:
 def parts(given: Any, method: str) -> tuple[Mapping[Any, Any], ...]:
     """Return the mappings by agent that `reset` or `step` has returned."""
     names = _PARTS[method]
-    if isinstance(given, tuple) and len(given) == len(names) and all(map(_is_mapping, given)):
-        return given
     shown = f"{len(given)} parts" if isinstance(given, tuple) else f"a {type(given).__name__}"
     if isinstance(given, tuple) and len(given) == len(names):
-        shown = next(f"{n} as a {type(p).__name__}" for n, p in zip(names, given, strict=True) if not _is_mapping(p))
+        named = zip(names, given, strict=True)
+        wrong = [f"{name} as a {type(part).__name__}" for name, part in named if not isinstance(part, Mapping)]
+        if not wrong:
+            return given
+        shown = wrong[0]
     raise UserError(f"'{method}' returns {shown}; return ({', '.join(names)}), each a mapping by agent")
-
-
-def _is_mapping(part: Any) -> bool:
-    return isinstance(part, Mapping)
 
 
 def numbers(given: Any, what: str, width: int | None = None) -> NDArray[np.float32]:

@@ -151,19 +151,20 @@ class Copy:
 
     def __init__(self, task: CopyHooks) -> None:
         self._task = task
-        self.env = foreign.by_agent(task.make_one())
+        env = task.make_one()
+        of_several = isinstance(getattr(getattr(env, "action_space", None), "spaces", None), Sequence)
+        self.env = foreign.ByAgent(env, alone=False) if of_several and not hasattr(env, "possible_agents") else env
         foreign.require_kind(self.env, foreign.PARALLEL, "make_one")
         self.agents = list(self.env.possible_agents)
+        listed = ", ".join(map(str, self.agents)) or "none"
         groups = {role: [name for name in self.agents if task.role_of(name) == role] for role in task.role_names}
         if empty := next((role for role, names in groups.items() if not names), None):
-            listed = ", ".join(map(str, self.agents)) or "none"
             raise UserError(
                 f"no agent's name begins with '{empty}'; the agents are {listed}; name those of a role in 'roles'"
             )
         everyone = [name for names in groups.values() for name in names] if groups else self.agents
         self.learners = [name for name in everyone if str(name).startswith(task.learners)]
         if not self.learners:
-            listed = ", ".join(map(str, self.agents)) or "none"
             raise UserError(f"no agent's name begins with '{task.learners}'; the agents are {listed}")
         if len(set(self.agents)) < len(self.agents):
             raise UserError("'possible_agents' names an agent twice; give each a name of its own")
@@ -191,7 +192,11 @@ class Copy:
         """Return the numbers of the layout that a learning agent sees."""
         row = foreign.numbers(self._task.reading(name, observation), f"what {name} sees")
         if (width := row.size) != (expected := self._task.layout_of(name).width):
-            raise UserError(f"{name} sees {width} numbers, but the layout has {expected}")
+            raise UserError(
+                f"{name} sees {width} numbers, but the layout has {expected}; where agents are unlike, begin "
+                "'learners' with the name of one kind, and let the others act by 'opponent', or give 'observation' and "
+                "'action' by role, as {'adversary': ..., 'agent': ...}, so that both learn"
+            )
         return row
 
     def seen(self, given: Mapping[Any, Any]) -> Array:
@@ -207,7 +212,6 @@ class Copy:
         task = self._task
         with self.naming("reset"):
             first, infos = self.start(0)
-        self._require_alike(first)
         for name in self.learners:
             with self.naming("reading"):
                 self.see(name, first[name])
@@ -230,26 +234,6 @@ class Copy:
             raise UserError("the task says what the state is, but its environment has no 'state' method")
         if task.state is not None and (got := self.state().size) != task.state.width:
             raise UserError(f"the environment's state has {got} numbers, but the layout has {task.state.width}")
-
-    def _require_alike(self, first: Mapping[Any, Any]) -> None:
-        """Refuse learning agents that see or do unlike things."""
-        with self.naming("reading"):
-            rows = ((name, self._task.reading(name, first[name])) for name in self.learners)
-            seen = {name: foreign.numbers(row, f"what {name} sees").size for name, row in rows}
-        one = self.learners[0]
-        for other in self.learners[1:]:
-            if self._task.role_of(one) != self._task.role_of(other):
-                one = other  # the first of the next role
-                continue
-            spaces = [foreign.space_of(self.env, name) for name in (one, other)]
-            does = [getattr(space, "n", None) or getattr(space, "shape", None) for space in spaces]
-            if seen[one] != seen[other] or does[0] != does[1]:
-                raise UserError(
-                    f"{one} sees {seen[one]} numbers and acts in {spaces[0]}, {other} sees {seen[other]} and acts in "
-                    f"{spaces[1]}, but all that learn must be alike; begin 'learners' with the name of one kind, and "
-                    "let the others act by 'opponent', or give 'observation' and 'action' by role, as "
-                    "{'adversary': ..., 'agent': ...}, so that both learn"
-                )
 
     def native(self, i: int, action: Array) -> Any:
         """Return an action of learning agent i as the environment takes it."""

@@ -5,6 +5,7 @@ The adapter needs `possible_agents`, `reset(seed)`, `step(actions)` and the spac
 
 from __future__ import annotations
 
+import multiprocessing
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -15,7 +16,7 @@ from torch import Tensor
 
 from esp_envs.adapters import require_attributes, seed_of
 from esp_envs.adapters.attributes import deciding_attributes, simulated_layout
-from esp_envs.adapters.copies import FINAL, NOW, TERMINATED, TRUNCATED, Board, Sizes, Stepper, WorkerCopies, can_fork
+from esp_envs.adapters.copies import FINAL, NOW, TERMINATED, TRUNCATED, Board, WorkerCopies
 from esp_envs.adapters.hooks import Array, Copy, CopyHooks
 from esp_envs.adapters.stepper import CopyStepper
 from esp_envs.base import Environment, Observation, Step, require_shape
@@ -24,7 +25,7 @@ from esp_envs.installed import available_cores
 from esp_envs.roles import Role, of_role, spec_with_roles, with_state
 from esp_envs.scene import Scene
 from esp_envs.settings import TaskSettings
-from esp_envs.spec import ActionSpace, Discrete, Layout, TaskSpec
+from esp_envs.spec import ActionSpace, Layout, TaskSpec
 
 _FEW_COPIES = 8  # up to this number of copies, worker processes cost more time than they save
 
@@ -66,7 +67,7 @@ class ParallelTask(CopyHooks, Environment):
         one.require_spaces()
         self._draws = getattr(one.simulator.bare, "render_mode", None) == "rgb_array"
         one.close()
-        self._copies: Stepper | None = None
+        self._copies: CopyStepper | WorkerCopies | None = None
         self._simulated = False
         lead = (self.num_seeds, num_envs)
         self._base = torch.zeros(lead, dtype=torch.int64)
@@ -188,23 +189,14 @@ class ParallelTask(CopyHooks, Environment):
         copies.place()
         return self._seen()
 
-    def _started(self) -> Stepper:
+    def _started(self) -> CopyStepper | WorkerCopies:
         if self._copies is None:
             count, workers = self._base.numel(), self._processes()
-            spec, action = self.spec, self.spec.action
-            sizes = Sizes(
-                count,
-                spec.num_agents,
-                spec.observation.width,
-                spec.state.width,
-                len(self.metrics),
-                None if isinstance(action, Discrete) else action.width,
-                action.count if isinstance(action, Discrete) and spec.masks else 0,
-            )
+            board = Board(self.spec, count, len(self.metrics))
             if workers:
-                self._copies = WorkerCopies(sizes, self._stepper, workers)
+                self._copies = WorkerCopies(board, self._stepper, workers)
             else:
-                self._copies = self._stepper(Board(sizes), range(count))
+                self._copies = self._stepper(board, range(count))
         return self._copies
 
     def _processes(self) -> int:
@@ -213,7 +205,7 @@ class ParallelTask(CopyHooks, Environment):
         if workers is None:
             cores = min(available_cores(), torch.get_num_threads())  # a run of a study has one of them
             workers = cores if cores > 1 and count > _FEW_COPIES else 0
-        return min(workers, count) if can_fork() else 0
+        return min(workers, count) if "fork" in multiprocessing.get_all_start_methods() else 0
 
     def _stepper(self, board: Board, copies: range) -> CopyStepper:
         return CopyStepper(self, board, copies, self._simulated)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -15,27 +15,23 @@ from esp_envs.installed import install, last_line
 from esp_envs.spec import Field, Items, Kind, Layout
 
 
-def maker(scenario: Any, num_envs: int, device: torch.device, arguments: Mapping[str, object]) -> Callable[[], Any]:
-    """Return what makes one simulator."""
+def simulator(scenario: Any, num_envs: int, device: torch.device, arguments: Mapping[str, object]) -> Any:
+    """Make one simulator."""
     try:
         import vmas  # noqa: PLC0415 - an extra
     except ImportError as error:
         raise UserError(f"a VMAS task needs a package that is missing ({error.name}): {install('vmas')}") from error
-
-    def make() -> Any:
-        try:
-            with warnings.catch_warnings():
-                warnings.filterwarnings("error", message="Scenario kwargs")  # VMAS warns of what it does not know
-                return vmas.make_env(scenario, num_envs, device=device, seed=0, **arguments)
-        except UserWarning as unknown:
-            told = str(unknown).partition(" passed")[0].removeprefix("Scenario kwargs: ")
-            raise UserError(
-                f"the VMAS scenario '{scenario}' has no arguments {told}; leave them out of what 'arguments' returns"
-            ) from unknown
-        except (AssertionError, TypeError, SystemExit) as error:
-            raise UserError(f"VMAS does not make '{scenario}' with {dict(arguments)}: {last_line(error)}") from error
-
-    return make
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("error", message="Scenario kwargs")  # VMAS warns of what it does not know
+            return vmas.make_env(scenario, num_envs, device=device, seed=0, **arguments)
+    except UserWarning as unknown:
+        told = str(unknown).partition(" passed")[0].removeprefix("Scenario kwargs: ")
+        raise UserError(
+            f"the VMAS scenario '{scenario}' has no arguments {told}; leave them out of what 'arguments' returns"
+        ) from unknown
+    except (AssertionError, TypeError, SystemExit) as error:
+        raise UserError(f"VMAS does not make '{scenario}' with {dict(arguments)}: {last_line(error)}") from error
 
 
 def rows(given: Sequence[Any], what: str, num_envs: int, width: int | None = None) -> Tensor:

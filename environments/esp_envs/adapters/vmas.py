@@ -86,8 +86,8 @@ class VmasTask(Environment):
     def __init__(self, settings: TaskSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
         super().__init__(settings, num_envs, generators)
         require_attributes(self, "scenario", "symmetry", "convention")
-        make = simulation.maker(self.scenario, num_envs, self.device, self.arguments())
-        self._sims = [make() for _ in self.generators]
+        made = self.scenario, num_envs, self.device, self.arguments()
+        self._sims = [simulation.simulator(*made) for _ in self.generators]
         self._numbers = [simulation.RandomNumbers(generator.initial_seed()) for generator in self.generators]
         given = self.seen()
         seen = given if isinstance(given, Mapping) else {"": given}

@@ -16,7 +16,6 @@ from esp_envs.epuck import formation_rules as rules
 from esp_envs.epuck.engines import make_physics
 from esp_envs.epuck.formation_spec import WHEEL_PAIRS, FormationSettings, formation_spec, nearest_pair
 from esp_envs.epuck.gl import open_painter
-from esp_envs.epuck.physics import Bodies
 from esp_envs.epuck.robot import BODY_RADIUS_M, DIMENSIONS, MAX_WHEEL_SPEED, Array
 from esp_envs.scene import Painter, Scene
 from esp_envs.settings import TaskSettings
@@ -138,7 +137,7 @@ class Formation(BatchedTask):
 
     def _place(self, pose: Array, velocity: Array) -> None:
         self._pending[:], self._arrived[:] = 0, False
-        self.physics.place(Bodies(pose, velocity, self._pillars, self._mass, self._friction))
+        self.physics.place(pose, velocity, self._pillars, self._mass, self._friction)
         self._look()
         self._touching = self._apart < self._contact
 

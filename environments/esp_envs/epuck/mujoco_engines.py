@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
-from esp_envs.epuck.physics import TIMESTEP_S, Bodies, Physics
+from esp_envs.epuck.physics import TIMESTEP_S, Physics
 from esp_envs.epuck.robot import (
     AXLE_M,
     BODY_HEIGHT_M,
@@ -54,12 +54,12 @@ class MujocoWorlds(Physics):
     def _model(self, arena: Arena) -> mujoco.MjModel:
         """Build one world: walls, robots, pillars."""
 
-    def place(self, bodies: Bodies) -> None:
-        self._move(bodies.pose, bodies.velocity)
+    def place(self, pose: Array, velocity: Array, pillars: Array, mass: Array, friction: Array) -> None:
+        self._move(pose, velocity)
         self._warmstart[:] = 0.0
         if self.arena.num_pillars:
-            self._pillars[..., :2] = bodies.pillars
-        self._make_of(bodies.mass, bodies.friction)
+            self._pillars[..., :2] = pillars
+        self._make_of(mass, friction)
 
     @abstractmethod
     def _move(self, pose: Array, velocity: Array) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -12,24 +11,6 @@ from esp_envs.epuck.robot import Arena, Array
 from esp_envs.errors import UserError
 
 TIMESTEP_S = 0.01
-
-
-@dataclass(frozen=True)
-class Bodies:
-    """Where everything is at the start of an episode, and what the robots are made of.
-
-    Shape:
-        pose [W, N, 3]: x, y (m) and heading (rad, counter-clockwise from the x axis).
-        velocity [W, N, 3]: of x, y (m/s) and heading (rad/s).
-        pillars [W, M, 2]: x, y (m).
-        mass, friction [W, N]: multiples of a robot's own; 1 is the e-puck.
-    """
-
-    pose: Array
-    velocity: Array
-    pillars: Array
-    mass: Array
-    friction: Array
 
 
 class Physics(ABC):
@@ -49,8 +30,16 @@ class Physics(ABC):
             )
 
     @abstractmethod
-    def place(self, bodies: Bodies) -> None:
-        """Put every world into this state; what follows depends on nothing before."""
+    def place(self, pose: Array, velocity: Array, pillars: Array, mass: Array, friction: Array) -> None:
+        """Put every world into a state; what follows depends on nothing before.
+
+        Args:
+            pose: [W, N, 3] x, y (m) and heading (rad, counter-clockwise from the x axis).
+            velocity: [W, N, 3] of x, y (m/s) and heading (rad/s).
+            pillars: [W, M, 2] x, y (m).
+            mass: [W, N], a multiple of an e-puck's.
+            friction: likewise.
+        """
 
     @abstractmethod
     def advance(self, wheels: Array) -> None:

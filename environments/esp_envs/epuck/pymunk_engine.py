@@ -16,7 +16,7 @@ import numpy as np
 import pymunk
 from pymunk.batch import BodyFields, Buffer, get_space_bodies, set_space_bodies
 
-from esp_envs.epuck.physics import TIMESTEP_S, Bodies, Physics
+from esp_envs.epuck.physics import TIMESTEP_S, Physics
 from esp_envs.epuck.robot import AXLE_M, BODY_RADIUS_M, FRICTION, GRAVITY_M_S2, MASS_KG, Arena, Array, chord
 
 ITERATIONS = 100  # iterations of the solver, which treats contacts in turn; with these many their order does not matter
@@ -75,13 +75,12 @@ class PymunkPlanar(Physics):
         self._robots.append(robots)
         return space
 
-    def place(self, bodies: Bodies) -> None:
-        self._pose[:], self._velocity[:], self._pillars[:] = bodies.pose, bodies.velocity, bodies.pillars
-        changed = np.argwhere(bodies.mass != self._mass)
-        for world, index in changed:
-            robot, mass = self._robots[world][index], float(bodies.mass[world, index])
-            robot.mass, robot.moment = MASS_KG * mass, _INERTIA * mass
-        self._mass, self._friction = bodies.mass.copy(), bodies.friction.copy()
+    def place(self, pose: Array, velocity: Array, pillars: Array, mass: Array, friction: Array) -> None:
+        self._pose[:], self._velocity[:], self._pillars[:] = pose, velocity, pillars
+        for world, index in np.argwhere(mass != self._mass):
+            robot, own = self._robots[world][index], float(mass[world, index])
+            robot.mass, robot.moment = MASS_KG * own, _INERTIA * own
+        self._mass, self._friction = mass.copy(), friction.copy()
 
     def advance(self, wheels: Array) -> None:
         self._force[:] = self._push(wheels)
@@ -108,7 +107,7 @@ class PymunkPlanar(Physics):
         return change * self._mass[..., None] * [MASS_KG, MASS_KG, _INERTIA] / TIMESTEP_S
 
     def load_state_dict(self, arrays: dict[str, Array]) -> None:
-        self.place(Bodies(**arrays))
+        self.place(**arrays)
 
 
 def _buffer(numbers: Array) -> Buffer:

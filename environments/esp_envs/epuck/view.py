@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import ImageColor
 
-from esp_envs.drawing import BACKGROUND, FRAME, GRID, TRAIL_WIDTH, fade, trails
+from esp_envs.drawing import BACKGROUND, FRAME, GRID, TRAIL_WIDTH, fade, grid_lines, trails
 from esp_envs.epuck.robot import AXLE_M, BODY_HEIGHT_M, BODY_RADIUS_M, WHEEL_RADIUS_M
 from esp_envs.errors import UserError
 from esp_envs.scene import GRID_SPACING, Body, Scene
@@ -227,10 +227,10 @@ def _add_arena(world: mujoco.MjsBody, window: tuple[float, float, float, float])
     _add(world, _Box, [far, far, _LAYER_M], [x, y, -3 * _LAYER_M], _OUTSIDE)
     _add(world, _Box, [half_x, half_y, _LAYER_M], [x, y, -_LAYER_M], BACKGROUND)
     line = _GRID_WIDTH_M / 2
-    for k in range(math.ceil(x_min / GRID_SPACING), math.floor(x_max / GRID_SPACING) + 1):
-        _add(world, _Box, [line, half_y, _LAYER_M], [k * GRID_SPACING, y, -_LAYER_M / 2], GRID)
-    for k in range(math.ceil(y_min / GRID_SPACING), math.floor(y_max / GRID_SPACING) + 1):
-        _add(world, _Box, [half_x, line, _LAYER_M], [x, k * GRID_SPACING, -_LAYER_M / 2], GRID)
+    for place in grid_lines(x_min, x_max, GRID_SPACING):
+        _add(world, _Box, [line, half_y, _LAYER_M], [place, y, -_LAYER_M / 2], GRID)
+    for place in grid_lines(y_min, y_max, GRID_SPACING):
+        _add(world, _Box, [half_x, line, _LAYER_M], [x, place, -_LAYER_M / 2], GRID)
     middle = WALL_HEIGHT_M / 2
     for side in (-1, 1):
         _add(world, _Box, [half_wall, half_y, middle], [x + side * (half_x + half_wall), y, middle], FRAME)

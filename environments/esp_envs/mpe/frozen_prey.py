@@ -32,9 +32,18 @@ class FrozenPrey:
     """Greedy moves of a learned prey; a file that is missing, damaged or of another task is refused."""
 
     def __init__(self, path: str, seed: int, num_inputs: int, num_actions: int, device: torch.device) -> None:
-        header, tensors = _read(path)
-        self._activation = _ACTIVATIONS[_checked(header, path)]
-        self.layers = [(w.to(device), b.to(device)) for w, b in _layers(tensors, seed, path)]
+        activation, tensors = _read(path)
+        self._activation = _ACTIVATIONS[activation]
+        layers = [(f"actor.layers.{k}.weight", f"actor.layers.{k}.bias") for k in range(len(tensors) // 2)]
+        if not layers or {name for pair in layers for name in pair} != set(tensors):
+            raise UserError(
+                f"the prey policy {path} has other weights than those of a plain mlp; train one without "
+                "network.layer_norm, network.symmetrise and network.separate_parts"
+            )
+        seeds = len(tensors[layers[0][0]])
+        if not 0 <= seed < seeds:
+            raise UserError(f"the prey policy {path} holds {seeds} seeds; there is no prey_policy_seed {seed}")
+        self.layers = [tuple(tensors[name][seed].float().to(device) for name in pair) for pair in layers]
         widths = [self.layers[0][0].shape[0], self.layers[-1][0].shape[1]]
         if widths != [num_inputs, num_actions]:
             raise UserError(
@@ -52,7 +61,8 @@ class FrozenPrey:
         return hidden.argmax(-1)
 
 
-def _read(path: str) -> tuple[dict[str, object], dict[str, Tensor]]:
+def _read(path: str) -> tuple[str, dict[str, Tensor]]:
+    """Return the activation and the tensors of the actor; what is intact was written by the application."""
     if not Path(path).is_file():
         raise UserError(f"there is no prey policy file at {path}; give the path of an exported prey policy")
     if Path(path).stat().st_size > _MOST_BYTES:
@@ -75,48 +85,15 @@ def _read(path: str) -> tuple[dict[str, object], dict[str, Tensor]]:
         intact = False
     if not intact:
         raise UserError(f"the prey policy {path} does not match its checksum; export it again")
-    return header, {name: tensor for name, tensor in tensors.items() if name.startswith("actor.")}
-
-
-def _checked(header: dict[str, object], path: str) -> str:
-    """Return the activation named in the header of a fitting policy."""
     wanted = {"format": POLICY_FORMAT, "version": POLICY_VERSION, "task": _TASK, "network": _NETWORK}
     for key, value in wanted.items():
         if header.get(key) != value:
             found = _short(repr(header.get(key)))
             raise UserError(f"the prey policy {path} has {key} {found}, but a prey needs {value!r}")
     activation = header.get("activation")
-    if not isinstance(activation, str) or activation not in _ACTIVATIONS:
-        found = _short(repr(activation))
-        raise UserError(f"the prey policy {path} has activation {found}; known are {', '.join(_ACTIVATIONS)}")
-    return activation
-
-
-def _layers(tensors: dict[str, Tensor], seed: int, path: str) -> list[tuple[Tensor, Tensor]]:
-    """Return (weight [in, out], bias [1, out]) of one seed, layer by layer, after checking that they chain."""
-    if other := sorted(name for name in tensors if not name.startswith("actor.layers.")):
-        raise UserError(
-            f"the prey policy {path} has '{_short(other[0])}', but a prey needs a plain mlp; train one without "
-            "network.layer_norm, network.symmetrise and network.separate_parts"
-        )
-    names = [(f"actor.layers.{k}.weight", f"actor.layers.{k}.bias") for k in range(len(tensors) // 2)]
-    if not names or {name for pair in names for name in pair} != set(tensors):
-        raise UserError(f"the prey policy {path} lacks a weight or bias of its actor's layers; export it again")
-    layers: list[tuple[Tensor, Tensor]] = []
-    for weight_name, bias_name in names:
-        weight, bias = tensors[weight_name], tensors[bias_name]
-        fits = weight.ndim == 3 and bias.shape == (weight.shape[0], 1, weight.shape[2])
-        if not fits or (layers and layers[-1][0].shape[1] != weight.shape[1]):
-            raise UserError(
-                f"the prey policy {path} has layers that do not fit together ({weight_name} {tuple(weight.shape)}, "
-                f"{bias_name} {tuple(bias.shape)}); export it again"
-            )
-        if not 0 <= seed < len(weight):
-            raise UserError(f"the prey policy {path} holds {len(weight)} seeds; there is no prey_policy_seed {seed}")
-        layers.append((weight[seed].float(), bias[seed].float()))
-    if not all(torch.isfinite(w).all() and torch.isfinite(b).all() for w, b in layers):
-        raise UserError(f"the prey policy {path} holds numbers that are not finite; export it again")
-    return layers
+    if activation not in _ACTIVATIONS:
+        raise UserError(f"the prey policy {path} has activation {activation!r}; known are {', '.join(_ACTIVATIONS)}")
+    return activation, {name: tensor for name, tensor in tensors.items() if name.startswith("actor.")}
 
 
 def digest(tensors: Mapping[str, Tensor], description: Mapping[str, Any]) -> str:

@@ -19,7 +19,7 @@ class ManyWorlds(ParticleWorlds):
 
     Args:
         sees: of the others in the crowd and of the landmarks, how many nearest ones each of the crowd sees; 0 for all.
-        crowd: the first agents, which see each other; all by default.
+        crowd: how many agents, the first ones, see each other.
         solid: whether landmarks push agents away.
 
     Attributes:
@@ -36,12 +36,12 @@ class ManyWorlds(ParticleWorlds):
         device: torch.device,
         velocity_first: bool,
         sees: int,
-        crowd: int | None = None,
-        solid: bool = False,
+        crowd: int,
+        solid: bool,
     ) -> None:
         agents, landmarks = bodies.num_agents, bodies.num_landmarks
-        self._crowd, self._num_solid = crowd or agents, agents + landmarks * solid
-        self._sees = (min(sees, self._crowd - 1), min(sees, landmarks))
+        self._crowd, self._num_solid = crowd, agents + landmarks * solid
+        self._sees = (min(sees, crowd - 1), min(sees, landmarks))
         self._radius = torch.tensor(bodies.radius, dtype=torch.float64, device=device)
         size = max(1, _PAIRS // (agents * (agents + landmarks)))
         self._chunks = [slice(k, min(k + size, num_worlds)) for k in range(0, num_worlds, size)]

@@ -11,11 +11,11 @@ import torch
 from pydantic import Field as Setting
 from torch import Tensor
 
-from esp_envs.batched import World, to_others
+from esp_envs.batched import World
 from esp_envs.mpe import covering
-from esp_envs.mpe.many import MOST_BODIES, ManyWorlds, ways_to
-from esp_envs.mpe.particles import Bodies, ParticleWorlds
-from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings, ParticleTask, half_side
+from esp_envs.mpe.many import ManyWorlds
+from esp_envs.mpe.particles import Bodies
+from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings, ParticleTask
 from esp_envs.scene import DARK, Body, Scene, look
 from esp_envs.spec import Field, Items, Kind, TaskSpec, filled_layout, layout
 
@@ -41,15 +41,6 @@ class NavigationSettings(ParticleSettings):
         gt=0,
         description="landmarks start in the square [-extent, extent]^2 (lengths); 0.8 by default, 1.0 for pettingzoo",
     )
-    sees: int = Setting(
-        0, ge=0, description="of the other agents and of the landmarks, how many nearest ones an agent sees; 0: all"
-    )
-    density: float | None = Setting(
-        None,
-        gt=0,
-        description="agents per 2 x 2 lengths at the start, however many there are, landmarks in the same square; by "
-        "default agents start in [-1, 1]^2",
-    )
     local_ratio: float = Setting(
         0.5, ge=0, le=1, description="pettingzoo convention only: weight of the own collisions against the team's term"
     )
@@ -63,20 +54,14 @@ class NavigationSettings(ParticleSettings):
         return self.landmark_extent or (self.half_side if self.density else LANDMARK_EXTENT[self.convention])
 
     @property
-    def half_side(self) -> float:
-        """Half the side of the square in which agents start, lengths."""
-        return half_side(self.num_agents, self.density)
+    def team(self) -> int:
+        return self.num_agents
 
     @property
     def seen(self) -> tuple[int, int]:
         """Landmarks and other agents that an agent sees."""
         landmarks, others = self.landmarks, self.num_agents - 1
         return (min(self.sees, landmarks), min(self.sees, others)) if self.sees else (landmarks, others)
-
-    @property
-    def many(self) -> bool:
-        """Whether pairs are too many to be listed, or only the nearest are seen."""
-        return self.sees > 0 or self.num_agents > MOST_BODIES
 
     def without_effect(self) -> frozenset[str]:
         return frozenset({"local_ratio"} if self.convention == "esp" else ())
@@ -200,22 +185,9 @@ class Navigation(ParticleTask):
             extent=(self.settings.half_side,) * agents + (self.settings.extent,) * landmarks,
         )
 
-    def _make_worlds(self, bodies: Bodies, num_worlds: int, velocity_first: bool) -> ParticleWorlds:
-        if not self.settings.many:
-            return super()._make_worlds(bodies, num_worlds, velocity_first)
-        return ManyWorlds(bodies, num_worlds, self.device, velocity_first, self.settings.sees)
-
     def _observe(self, world: World) -> Tensor:
-        velocity, position, landmarks = world["velocity"], world["position"], world["landmarks"]
-        if self.settings.sees and isinstance(self.worlds, ManyWorlds):
-            worlds = self.worlds
-            seen = (
-                ways_to(worlds.seen_landmarks, landmarks, position),
-                ways_to(worlds.seen_agents, position, position),
-            )
-        else:
-            seen = (landmarks.unsqueeze(-3) - position.unsqueeze(-2), to_others(position))
-        return torch.cat([velocity, position, *(ways.flatten(-2) for ways in seen)], -1)
+        position = world["position"]
+        return torch.cat([world["velocity"], position, *self._ways(position, world["landmarks"])], -1)
 
     def heuristic(self, name: str | None = None) -> Tensor:
         """Return the joint action of `nearest` (default) or `cover`."""

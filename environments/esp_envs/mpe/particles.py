@@ -18,7 +18,6 @@ rims.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -93,7 +92,10 @@ class ParticleWorlds:
         self.position = self.physics[agents : 2 * agents]
         self.entity = self.physics[agents:]
         pairs, contacts = [*bodies.contacts, *bodies.watched], len(bodies.contacts)
-        self._differences = _difference_matrix(pairs, len(bodies.radius)).to(device)
+        # [pairs, entities]: times the positions it gives position[a] - position[b]
+        first, second = torch.tensor(pairs, dtype=torch.int64).view(-1, 2).unbind(1)
+        basis = torch.eye(len(bodies.radius))
+        self._differences = (basis[first] - basis[second]).to(device)
         self._pushes = self._differences[:contacts, :agents].t().contiguous()
         self._offset = torch.zeros(len(pairs), 2, lanes, device=device)
         self._contact_offset = self._offset[:contacts]
@@ -184,13 +186,6 @@ def _products_are_rounded(device: str) -> bool:
     if precision is None:  # before PyTorch 2.9 one switch covered all devices
         return torch.get_float32_matmul_precision() != "highest" or torch.is_autocast_enabled(device)
     return precision not in ("none", "ieee") or torch.is_autocast_enabled(device)
-
-
-def _difference_matrix(pairs: Sequence[tuple[int, int]], num_entities: int) -> Tensor:
-    """Return [pairs, entities] with +1 at a and -1 at b: times the positions it gives position[a] - position[b]."""
-    first, second = torch.tensor(pairs, dtype=torch.int64).view(-1, 2).unbind(1)
-    basis = torch.eye(num_entities)
-    return basis[first] - basis[second]
 
 
 def _rows(values: Tensor, lanes: int) -> Tensor:

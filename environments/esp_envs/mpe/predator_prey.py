@@ -11,10 +11,9 @@ import torch
 from torch import Tensor
 
 from esp_envs.base import joined
-from esp_envs.batched import World, to_others
+from esp_envs.batched import World
 from esp_envs.mpe.frozen_prey import FrozenPrey
-from esp_envs.mpe.many import ManyWorlds, ways_to
-from esp_envs.mpe.particles import Bodies, ParticleWorlds
+from esp_envs.mpe.particles import Bodies
 from esp_envs.mpe.predator_prey_spec import PredatorPreySettings, predator_prey_spec, prey_layout
 from esp_envs.mpe.task import MOVES, ParticleTask, nearest_move, unit_disc
 from esp_envs.scene import COLORS, PALE, Body, Scene, look
@@ -104,6 +103,7 @@ class PredatorPrey(ParticleTask):
     Settings: ClassVar[type[PredatorPreySettings]] = PredatorPreySettings
     heuristics = ("chase",)
     settings: PredatorPreySettings
+    solid = True
 
     def __init__(self, settings: PredatorPreySettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
         self._prey_learns = settings.control != "predators"
@@ -140,12 +140,6 @@ class PredatorPrey(ParticleTask):
             extent=(half,) * agents + (half * OBSTACLE_EXTENT,) * obstacles,
         )
 
-    def _make_worlds(self, bodies: Bodies, num_worlds: int, velocity_first: bool) -> ParticleWorlds:
-        if not self.settings.many:
-            return super()._make_worlds(bodies, num_worlds, velocity_first)
-        crowd, sees = self.settings.num_predators, self.settings.sees
-        return ManyWorlds(bodies, num_worlds, self.device, velocity_first, sees, crowd, solid=True)
-
     @property
     def prey_moves(self) -> Tensor:
         """The random prey's controls of this episode, a view [horizon, S, E, 2] that may be written to."""
@@ -155,26 +149,15 @@ class PredatorPrey(ParticleTask):
         prey_sees = self._prey_sees(world).unsqueeze(-2)
         if self.settings.control == "prey":
             return prey_sees
-        here, prey, velocity = world["position"], world["prey_position"], world["velocity"]
-        if self.settings.sees and isinstance(self.worlds, ManyWorlds):
-            seen = [ways_to(self.worlds.seen_agents, here, here).flatten(-2)]
-            if "obstacles" in world:
-                seen.insert(0, ways_to(self.worlds.seen_landmarks, world["obstacles"], here).flatten(-2))
-        else:
-            seen = [self._obstacles_from(here, world), to_others(here).flatten(-2)]
-        parts = [velocity, here, *seen]
+        here, prey = world["position"], world["prey_position"]
+        parts = [world["velocity"], here, *self._ways(here, world.get("obstacles"))]
         rows = torch.cat([*parts, prey - here, world["prey_velocity"].expand_as(here)], -1)
         return joined([rows, prey_sees]) if self._prey_learns else rows
 
     def _prey_sees(self, world: World) -> Tensor:
         prey = world["prey_position"]
-        others = (world["position"] - prey).flatten(-2).unsqueeze(-2)
-        return torch.cat([world["prey_velocity"], prey, self._obstacles_from(prey, world), others], -1).squeeze(-2)
-
-    def _obstacles_from(self, place: Tensor, world: World) -> Tensor:
-        if "obstacles" not in world:
-            return place[..., :0]
-        return (world["obstacles"].unsqueeze(-3) - place.unsqueeze(-2)).flatten(-2)
+        ways = [(world[name] - prey).flatten(-2).unsqueeze(-2) for name in ("obstacles", "position") if name in world]
+        return torch.cat([world["prey_velocity"], prey, *ways], -1).squeeze(-2)
 
     def heuristic(self, name: str | None = None) -> Tensor:
         """Return the joint action of `chase`: that of predators that learn, the flight of such a prey."""

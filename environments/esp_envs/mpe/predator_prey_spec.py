@@ -10,7 +10,7 @@ from pydantic import field_validator, model_validator
 
 from esp_envs.errors import UserError
 from esp_envs.mpe.many import MOST_BODIES
-from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings, half_side
+from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings
 from esp_envs.roles import Role, spec_with_roles
 from esp_envs.settings import Breaks
 from esp_envs.spec import Field, Items, Kind, Layout, TaskSpec, filled_layout
@@ -21,17 +21,6 @@ class PredatorPreySettings(ParticleSettings):
 
     num_predators: int = Setting(3, ge=1, le=100_000, description="predators; 3 in the paper")
     num_obstacles: int = Setting(2, ge=0, le=100_000, description="fixed discs; 2 in MPE, 3 by the authors' launcher")
-    sees: int = Setting(
-        0,
-        ge=0,
-        description="of the other predators and of the obstacles, how many nearest ones one sees; 0: all",
-    )
-    density: float | None = Setting(
-        None,
-        gt=0,
-        description="predators per 2 x 2 lengths at the start, however many there are; by default all start in "
-        "[-1, 1]^2. Obstacles, and the bounds of the prey, grow with the square",
-    )
     control: Literal["predators", "prey", "both"] = Setting(
         "predators",
         description="who learns; with 'prey' the predators follow the heuristic `chase`, with 'both' each side learns",
@@ -53,14 +42,12 @@ class PredatorPreySettings(ParticleSettings):
         return path and str(Path(path).absolute())
 
     @property
-    def half_side(self) -> float:
-        """Half the side of the square in which agents start, lengths."""
-        return half_side(self.num_predators, self.density)
+    def team(self) -> int:
+        return self.num_predators
 
     @property
     def many(self) -> bool:
-        """Whether pairs are too many to be listed, or only the nearest are seen."""
-        return self.sees > 0 or self.num_predators >= MOST_BODIES
+        return super().many or self.num_predators == MOST_BODIES  # with the prey there is one more
 
     @property
     def turns(self) -> str:

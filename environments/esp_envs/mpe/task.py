@@ -9,14 +9,15 @@ import math
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import torch
 from pydantic import Field as Setting
 from torch import Tensor
 
 from esp_envs.base import Observation
-from esp_envs.batched import BatchedTask, Outcome, World
+from esp_envs.batched import BatchedTask, Outcome, World, to_others
+from esp_envs.mpe.many import MOST_BODIES, ManyWorlds, ways_to
 from esp_envs.mpe.particles import Bodies, ParticleWorlds, exact_matmul
 from esp_envs.settings import Breaks, TaskSettings
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Continuous, Discrete, Field, Kind, layout
@@ -61,15 +62,37 @@ class ParticleSettings(TaskSettings):
         0.0, ge=0, le=10, description="breaks symmetry: the reward counts places that lie so far to the right, lengths"
     )
 
+    sees: int = Setting(
+        0,
+        ge=0,
+        description="of the others of its team, and of landmarks or obstacles, how many nearest ones one sees; 0: all",
+    )
+    density: float | None = Setting(
+        None,
+        gt=0,
+        description="agents of the team per 2 x 2 lengths at the start, however many there are; by default all start "
+        "in [-1, 1]^2. What else starts in a square grows with it",
+    )
+
     @property
     def turns(self) -> str:
         """The rotations that actions, dynamics and reward carry."""
         return "c4" if self.actions == "discrete" else "so2"
 
+    @property
+    def team(self) -> int:
+        """Agents, the first of all, that see each other."""
+        raise NotImplementedError
 
-def half_side(agents: int, density: float | None) -> float:
-    """Return half the side of the square in which agents start, lengths, with `density` of them per 2 x 2 lengths."""
-    return math.sqrt(agents / density) if density else 1.0
+    @property
+    def half_side(self) -> float:
+        """Half the side of the square in which agents start, lengths."""
+        return math.sqrt(self.team / self.density) if self.density else 1.0
+
+    @property
+    def many(self) -> bool:
+        """Whether pairs are too many to be listed, or only the nearest are seen."""
+        return self.sees > 0 or self.team > MOST_BODIES
 
 
 class ParticleTask(BatchedTask):
@@ -83,6 +106,8 @@ class ParticleTask(BatchedTask):
     settings: ParticleSettings
     first_learner = 0
     """Index of the first of the agents that learn; the task drives the others."""
+    solid: ClassVar[bool] = False
+    """Whether landmarks push agents away."""
 
     def __init__(self, settings: ParticleSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
         super().__init__(settings, num_envs, generators)
@@ -90,7 +115,10 @@ class ParticleTask(BatchedTask):
         gain = torch.tensor(bodies.gain, device=self.device).view(-1, 1, 1)
         weak = (bodies.gain[0] * (1 - settings.weak_agent), *bodies.gain[1:])
         num_worlds, velocity_first = self.num_seeds * num_envs, settings.convention == "esp"
-        self.worlds = self._make_worlds(replace(bodies, gain=weak), num_worlds, velocity_first)
+        made = replace(bodies, gain=weak), num_worlds, self.device, velocity_first
+        self.worlds = (
+            ManyWorlds(*made, settings.sees, settings.team, self.solid) if settings.many else ParticleWorlds(*made)
+        )
         lanes = self.worlds.num_lanes
         counts = [field.count for field in spec.state.fields]
         rows = self._by_world(self.worlds.physics).split(counts, 2)
@@ -109,14 +137,10 @@ class ParticleTask(BatchedTask):
             self.world["gusts"] = self._by_world(self._gusts)
         self._shift = torch.tensor([[settings.reward_offset], [0.0]], device=self.device)
         self._readout: Tensor | None = None
-        if type(self.worlds) is ParticleWorlds:
+        if not settings.many:
             # the matrix of a linear function is what it gives for the basis vectors
             readout = self._observe(self._split(torch.eye(spec.state.width)))
             self._readout = readout.flatten(1).to(self.device)
-
-    def _make_worlds(self, bodies: Bodies, num_worlds: int, velocity_first: bool) -> ParticleWorlds:
-        """Return the worlds; those of another class have observations that are no matrix product."""
-        return ParticleWorlds(bodies, num_worlds, self.device, velocity_first)
 
     @abstractmethod
     def _bodies(self) -> Bodies:
@@ -205,6 +229,16 @@ class ParticleTask(BatchedTask):
             self._learner_control[:, :, :worlds] = action.reshape(worlds, learners, 2).permute(1, 2, 0)
         if self.settings.action_turn_rad:
             self._learner_control.copy_(_turned(self._learner_control, self.settings.action_turn_rad))
+
+    def _ways(self, position: Tensor, things: Tensor | None) -> list[Tensor]:
+        """Return the ways [S, E, N, 2 k] from a team at `position` to the things, and to the others, that each sees."""
+        worlds, to = self.worlds, [] if things is None else [things]
+        if isinstance(worlds, ManyWorlds) and self.settings.sees:
+            ways = [ways_to(worlds.seen_landmarks, places, position) for places in to]
+            ways.append(ways_to(worlds.seen_agents, position, position))
+        else:
+            ways = [*(places.unsqueeze(-3) - position.unsqueeze(-2) for places in to), to_others(position)]
+        return [way.flatten(-2) for way in ways]
 
     def _to_action(self, wish: Tensor) -> Tensor:
         """Turn wishes [N, 2, W'] (1 is a full force) into a joint action of this task's kind."""

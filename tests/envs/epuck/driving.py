@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from esp_envs.epuck.engines import make_physics
-from esp_envs.epuck.physics import Bodies, Physics
+from esp_envs.epuck.physics import Physics
 from esp_envs.epuck.robot import BODY_RADIUS_M, MAX_WHEEL_SPEED, Arena, Array
 
 PERIOD_S = 0.1
 
 
-def bodies(arena: Arena, pose: Array, **others: Array) -> Bodies:
+def bodies(arena: Arena, pose: Array, **others: Array) -> dict[str, Array]:
     """Return worlds with the robots at `pose` [W, N, 3], at rest and as heavy and grippy as any e-puck."""
     worlds, robots = pose.shape[:2]
     usual = {
@@ -20,7 +20,7 @@ def bodies(arena: Arena, pose: Array, **others: Array) -> Bodies:
         "mass": np.ones((worlds, robots)),
         "friction": np.ones((worlds, robots)),
     }
-    return Bodies(pose=pose, **{**usual, **others})
+    return {"pose": pose} | usual | others
 
 
 def at_posts(arena: Arena, worlds: int, rng: np.random.Generator) -> Array:
@@ -32,7 +32,7 @@ def at_posts(arena: Arena, worlds: int, rng: np.random.Generator) -> Array:
 def engine(name: str, arena: Arena, pose: Array, **others: Array) -> Physics:
     """Return the worlds `bodies` describes, in the engine `name`."""
     physics = make_physics(name, arena, len(pose), PERIOD_S)
-    physics.place(bodies(arena, pose, **others))
+    physics.place(**bodies(arena, pose, **others))
     return physics
 
 

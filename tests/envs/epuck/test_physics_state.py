@@ -42,7 +42,7 @@ def test_place_forgets_the_past(name: str, in_contact: bool) -> None:
         start = bodies(ARENA, at_posts(ARENA, WORLDS, rng), **made_of(rng))
     fresh = make_physics(name, ARENA, WORLDS, PERIOD_S)
     for physics in (fresh, used):
-        physics.place(start)
+        physics.place(**start)
     np.testing.assert_array_equal(heap(used, 50), heap(fresh, 50))
 
 
@@ -84,7 +84,7 @@ def test_the_number_of_threads_changes_nothing(name: str) -> None:
     records = []
     for threads in (1, 2):
         physics = make_physics(name, ARENA, WORLDS, PERIOD_S, threads)
-        physics.place(start)
+        physics.place(**start)
         records.append(heap(physics, 40))
     np.testing.assert_array_equal(*records)
 
@@ -95,7 +95,7 @@ def test_pillars_move_with_the_state(name: str) -> None:
     pose = np.array([[[0.0, 0.0, 0.0]]])
     physics = engine(name, arena, pose, pillars=np.array([[[0.2, 0.0], [-0.2, 0.0]]]))
     state = physics.state_dict()
-    physics.place(bodies(arena, pose))
+    physics.place(**bodies(arena, pose))
     for _ in range(30):
         physics.advance(np.full((1, 1, 2), 6.28))
     assert physics.pose[0, 0, 0] > 0.3, "no pillar in the way"
