@@ -1,7 +1,6 @@
 """Whether a task is as symmetric as it claims: from paired states where it can be set to one, else from transitions."""
 
-from esp_cli.checking.candidates import candidates
-from esp_cli.checking.naming import named
+from esp_cli.checking.candidates import candidates, named
 from esp_cli.checking.paired import check_paired
 from esp_cli.checking.policy import PolicyVerdict, check_policy
 from esp_cli.checking.recorded import Transitions, collect

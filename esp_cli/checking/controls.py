@@ -115,47 +115,12 @@ class Sides(NamedTuple):
     planted_said: Tensor
     planted_true: Tensor
 
+    def planted(self, number: int, amounts: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what is predicted of a number and what it is, with an amount [B] of each control added."""
+        said, true = self.said[..., number, None], self.true[..., number, None]
+        return said + amounts * self.planted_said, true + amounts * self.planted_true
+
 
 def trust_in(said: Tensor, true: Tensor) -> Tensor:
     """Return by how much to shrink predictions so that they err least, 0 to 1: a predictor takes some noise for law."""
     return ((said * true).mean((0, 1, 2)) / said.square().mean((0, 1, 2)).clamp_min(1e-20)).clamp(0, 1)
-
-
-class Products:
-    """Weighted means, over the steps and agents of each episode, of products of what is predicted and what is true.
-
-    They give the squared errors of a number s (true: t) with any amount a of each control p (true: q) added to it:
-    (r (s + a p) - (t + a q))^2, where r is the trust.
-    """
-
-    def __init__(self, side: Sides, weight: Tensor) -> None:
-        self._pairs, self._weight = torch.stack([side.said, side.true], -1).flatten(1, 2), weight.flatten(1, 2)
-        self._planted = torch.cat([side.planted_said, side.planted_true], -1).flatten(1, 2)
-        p, q = (self._weight * self._planted).chunk(2, -1)
-        said, true = self._planted.chunk(2, -1)
-        self._squares = (p * said).mean(1), (p * true).mean(1), (q * true).mean(1)
-
-    def _of(self, number: int, amounts: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the means of (s + a p)^2, (s + a p)(t + a q) and (t + a q)^2, [M, B] each."""
-        pair = self._pairs[..., number, :]
-        weighted = (self._weight * pair).mT / pair.shape[1]
-        own = weighted @ pair
-        ss, st, tt = own[:, 0, 0], own[:, 0, 1], own[:, 1, 1]
-        crossed = weighted @ self._planted
-        (sp, sq), (tp, tq) = (row.chunk(2, -1) for row in crossed.unbind(1))
-        pp, pq, qq = self._squares
-        return (
-            ss.unsqueeze(-1) + amounts * (2 * sp + amounts * pp),
-            st.unsqueeze(-1) + amounts * (sq + tp + amounts * pq),
-            tt.unsqueeze(-1) + amounts * (2 * tq + amounts * qq),
-        )
-
-    def trust(self, number: int, amounts: Tensor) -> Tensor:
-        """Return by how much to shrink predictions with controls added, [B]; see `trust_in`."""
-        squares, products, _ = self._of(number, amounts)
-        return (products.mean(0) / squares.mean(0).clamp_min(1e-20)).clamp(0, 1)
-
-    def errors(self, number: int, amounts: Tensor, trust: Tensor) -> Tensor:
-        """Return the squared errors with controls added, [M, B]."""
-        squares, products, true = self._of(number, amounts)
-        return trust * (trust * squares - 2 * products) + true

@@ -64,25 +64,20 @@ def check_policy(trained: TrainedPolicy, make: MakeWorlds, transforms: str | Non
             observation = env.step(action).next
         verdicts = []
         for element in candidates(env.spec, transforms):
-            transform, memory, same, pairs = build_transform([element], env.spec), blank, [], []
+            transform, memory, pairs = build_transform([element], env.spec), blank, []
             for there, action in steps:
                 mask = None if there.action_mask is None else transform.push_outputs(there.action_mask)
                 moved, memory = policy.act(transform.obs(there.obs), memory, action_mask=mask)
-                same.append(_same(moved, transform.action(action)))
                 pairs.append((moved, transform.action(action)))
-            verdicts.append(PolicyVerdict(element.name, float(torch.stack(same).float().mean()), _distance(pairs)))
+            verdicts.append(PolicyVerdict(element.name, *_compared(pairs)))
     return verdicts
 
 
-def _distance(pairs: Sequence[tuple[Tensor, Tensor]]) -> float | None:
-    moved, image = (torch.stack(part) for part in zip(*pairs, strict=True))  # [T, S, E, N, numbers]
+def _compared(pairs: Sequence[tuple[Tensor, Tensor]]) -> tuple[float, float | None]:
+    """Return agreement and distance of actions and of those that were expected."""
+    moved, image = (torch.stack(part) for part in zip(*pairs, strict=True))  # [T, S, E, N(, numbers)]
     if not moved.is_floating_point():
-        return None
+        return float((moved == image).float().mean()), None
+    same = ((moved - image).abs() < CLOSE).all(-1)
     gap, unrelated = ((moved - x).square().mean() for x in (image, image.roll(1, 2)))  # of the next world
-    return float((gap / unrelated.clamp_min(1e-30)).sqrt())
-
-
-def _same(action: Tensor, expected: Tensor) -> Tensor:
-    if action.is_floating_point():
-        return ((action - expected).abs() < CLOSE).all(-1)
-    return action == expected
+    return float(same.float().mean()), float((gap / unrelated.clamp_min(1e-30)).sqrt())

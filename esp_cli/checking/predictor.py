@@ -91,14 +91,14 @@ class Predictor:
         bumps = (-(vectors - self._middles).square().sum(-1) / (2 * _BREADTH**2)).exp().flatten(-2)
         parts = [self._products(data), bumps]
         if agents > 1:
-            own = torch.cat([torch.ones_like(seen[..., :1]), self._done(data)], -1)
+            own = torch.cat([torch.ones_like(seen[..., :1]), done(data, self._spaces)], -1)
             parts.append((torch.eye(agents).unsqueeze(-1) * own.unsqueeze(-2)).flatten(-2))
         return torch.cat(parts, -1)
 
     def _products(self, data: Transitions) -> Tensor:
         """Return 1, what each agent sees and does, products of two of these numbers, and the others' numbers."""
-        action, space = data.action, self._spaces.action
-        acted = F.one_hot(action, space.count).float()[..., 1:] if isinstance(space, Discrete) else action
+        acted = done(data, self._spaces)
+        acted = acted[..., 1:] if isinstance(self._spaces.action, Discrete) else acted
         columns = torch.cat([data.obs, acted], -1).movedim(-1, 0).contiguous()  # [numbers, M, T, N]
         orders, numbers = self._orders, len(columns)
         known = columns if len(orders) * numbers <= _WIDEST_OTHERS else columns[self._spaces.observation.width :]
@@ -115,15 +115,17 @@ class Predictor:
     def _standard(self, x: Tensor) -> Tensor:
         return (x - self._centre) / self._width
 
-    def _done(self, data: Transitions) -> Tensor:
-        action = self._spaces.action
-        return F.one_hot(data.action, action.count).float() if isinstance(action, Discrete) else data.action
-
     def _seen(self, data: Transitions) -> Tensor:
         """Return what each agent sees and does, what the others do, and who it is: [M, T, N, numbers]."""
-        acted, agents = self._done(data), self._spaces.num_agents
+        acted, agents = done(data, self._spaces), self._spaces.num_agents
         others = [acted[:, :, order] for order in self._orders]
         return torch.cat([data.obs, acted, *others, torch.eye(agents).expand(*data.obs.shape[:3], -1)], -1)
+
+
+def done(data: Transitions, spaces: Spaces) -> Tensor:
+    """Return actions as numbers [M, T, N, A], a discrete one as one for each choice."""
+    action = spaces.action
+    return F.one_hot(data.action, action.count).float() if isinstance(action, Discrete) else data.action
 
 
 class _Cells:

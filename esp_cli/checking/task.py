@@ -8,8 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from esp_cli.checking import paired, transitions
-from esp_cli.checking.candidates import candidates, refused
-from esp_cli.checking.naming import named
+from esp_cli.checking.candidates import candidates, named, refused
 from esp_cli.checking.recorded import Transitions, collect
 from esp_cli.checking.shifting import SHIFT, Shift
 from esp_cli.checking.verdicts import ElementVerdict, Watch
@@ -147,22 +146,15 @@ def judged(
         return env
 
     carried = [element for element in elements if _is_carried(element, probe.spec)]
-    found = paired.check_paired(settable, carried, None if native else _FOREIGN, watch, until, spare)
-    verdicts = dict(zip(carried, found, strict=True))
+    by_pairs = paired.check_paired(settable, carried, None if native else _FOREIGN, watch, until, spare)
+    verdicts = dict(zip(carried, by_pairs, strict=True))
     if rest := [element for element in elements if element not in verdicts]:  # items that the simulator does not name
-        by_rows = judged(make, rest, True, watch, min(until, spare))[1]
-        verdicts |= zip(rest, by_rows if _everybody(probe) == 1 else map(_unseen, by_rows), strict=True)
+        everybody = probe.inner.spec if isinstance(probe, RoleView) else probe.spec
+        for element, found in zip(rest, judged(make, rest, True, watch, min(until, spare))[1], strict=True):
+            # what others see may say what a colour or word means
+            unseen = everybody.num_agents > 1 and found.outcome == "holds"
+            verdicts[element] = replace(found, fields=(), reason=_SEVERAL) if unseen else found
     return PAIRED, [verdicts[element] for element in elements]
-
-
-def _everybody(env: Environment) -> int:
-    """Return how many agents there are, of all roles."""
-    return env.inner.spec.num_agents if isinstance(env, RoleView) else env.spec.num_agents
-
-
-def _unseen(verdict: ElementVerdict) -> ElementVerdict:
-    """Return a verdict by each agent's own transitions, where what others see may say what a colour or word means."""
-    return replace(verdict, fields=(), reason=_SEVERAL) if verdict.outcome == "holds" else verdict
 
 
 def _is_carried(element: Element | Shift, spaces: Spaces) -> bool:

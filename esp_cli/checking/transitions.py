@@ -22,11 +22,10 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
 
 from esp_cli.checking.candidates import is_declared
-from esp_cli.checking.controls import STILL, Controls, Products, Sides, strength, trust_in
-from esp_cli.checking.predictor import Predictor
+from esp_cli.checking.controls import STILL, Controls, Sides, strength, trust_in
+from esp_cli.checking.predictor import Predictor, done
 from esp_cli.checking.recorded import Transitions, outputs_of, turned
 from esp_cli.checking.verdicts import (
     SIGNIFICANT,
@@ -108,14 +107,14 @@ def _judge(element: Element, spaces: Spaces, halves: Sequence[_Half], first: Tra
     verdicts = []
     for name in halves[0].fields:
         alone, squares, planted = (torch.cat([one.fields[name][k] for one in compared]) for k in range(3))
-        still = halves[0].is_still(name)
-        never = name == "reward" and not any(half.is_paid for half in halves)
+        still = float(halves[0].spread[halves[0].fields[name]].sum()) < STILL**2
+        never = name == "reward" and not any(half.held.reward.any() for half in halves)
         # that it never changes is its law where it is seen; that of a reward that never came is unknown
         of_nothing = concluded(name, 0.0, 0.0, broken=False, p_value=float(never))
         verdicts.append(of_nothing if still else _judged(name, alone, squares, planted[:, counts]))
     found = ElementVerdict(element.name, declared, tuple(verdicts))
     image = turned(first, transform)
-    shift, preference = _shift(first.obs, image.obs), _shift(_done(first, spaces), _done(image, spaces))
+    shift, preference = _shift(first.obs, image.obs), _shift(done(first, spaces), done(image, spaces))
     if shift > (_PREFERS if found.outcome == "broken" else _ELSEWHERE):
         return ElementVerdict(element.name, declared, (), f"the starts differ from their image by {shift:.2f} s.d.")
     if preference > _PREFERS and found.outcome == "broken":
@@ -151,53 +150,45 @@ class _Half:
     """A predictor of one half of the episodes, and what it errs by on the other.
 
     Attributes:
+        held: the other.
         fields: which outputs are of which field.
+        spread: variance of each output.
     """
 
     def __init__(self, spaces: Spaces, controls: Controls, fitted: Transitions, held: Transitions) -> None:
         outputs, width = outputs_of(fitted), spaces.observation.width
-        self._width, self._controls, self._held = outputs.shape[-1], controls, held
+        self._width, self._controls, self.held = outputs.shape[-1], controls, held
         self._mean, self._deviation = outputs.mean((0, 1, 2)), outputs.flatten(0, 2).std(0)
         self._predict = Predictor(spaces, fitted, self._targets(fitted), controls(fitted))
         self._planted = controls(held)
         self._here = self._sides(held, self._planted)
         self._trust = trust_in(self._here.said, self._here.true)
         self._errors = (self._trust * self._here.said - self._here.true).square()
-        self._spread = self._here.true.flatten(0, 2).var(0)
+        self.spread = self._here.true.flatten(0, 2).var(0)
         self.fields = {f"obs.{name}": where for name, where in spaces.observation.slices().items()}
         self.fields |= {"reward": slice(width, width + 1)}
         self.fields |= {"action mask": slice(width + 1, None)} if self._width > width + 1 else {}
 
-    @property
-    def is_paid(self) -> bool:
-        """Whether any reward came."""
-        return bool(self._held.reward.any())
-
-    def is_still(self, name: str) -> bool:
-        """Return whether a field never changes."""
-        return float(self._spread[self.fields[name]].sum()) < STILL**2
-
     @torch.no_grad()
     def compared(self, transform: Transform) -> _Compared:
         """Compare errors on images with those on originals."""
-        image = turned(self._held, transform)
+        image = turned(self.held, transform)
         inside = self._predict.covers(image).float().unsqueeze(-1)
         weight = inside / inside.mean().clamp_min(STILL)
         carried = transform.per_agent(self._planted.movedim(-1, 0)).movedim(0, -1)
         there, (size, counts) = self._sides(image, carried), strength(carried, self._controls(image), weight)
         worse = weight * ((self._trust * there.said - there.true).square() - self._errors)
-        plain = Products(self._here, torch.ones_like(weight))
-        sums = [Products(side, weight) for side in (self._here, there)]
         fields = {}
         for name, where in self.fields.items():
             main = where.start + int(self._deviation[where].argmax())
-            variance = self._spread[where].sum().clamp_min(STILL**2)
+            variance = self.spread[where].sum().clamp_min(STILL**2)
             amounts = TOLERATED * (variance / size).sqrt()
-            trust = plain.trust(main, amounts)
-            before, after = (side.errors(main, amounts, trust) for side in sums)
+            sides = self._here.planted(main, amounts), there.planted(main, amounts)
+            trust = trust_in(*sides[0])
+            before, after = ((weight * (trust * said - true).square()).mean((1, 2)) for said, true in sides)
             others = (worse[..., where].sum(-1) - worse[..., main]).mean((1, 2)).unsqueeze(-1)
             squares = worse[..., self._width :][..., where].sum(-1).mean((1, 2))
-            of_squares = self._spread[self._width :][where].sum().clamp_min(STILL**2)
+            of_squares = self.spread[self._width :][where].sum().clamp_min(STILL**2)
             alone = worse[..., where].sum(-1).mean((1, 2)) / variance
             parts = alone, squares / of_squares, (after - before + others) / variance
             fields[name] = tuple(part.double() for part in parts)
@@ -243,8 +234,12 @@ def _refuse_what_says_nothing(spaces: Spaces, data: Transitions) -> None:
     lead = (*data.obs.shape[:2], spaces.num_agents)
     width = () if isinstance(spaces.action, Discrete) else (spaces.action.width,)
     seen = (*lead, spaces.observation.width)
-    for name, shape in (("obs", seen), ("action", (*lead, *width)), ("reward", lead), ("next_obs", seen)):
-        if (found := tuple(getattr(data, name).shape)) != shape or len(lead) != 3:
+    shapes = {"obs": seen, "action": (*lead, *width), "reward": lead, "next_obs": seen}
+    if data.action_mask is not None and isinstance(spaces.action, Discrete):
+        shapes["action_mask"] = (*lead, spaces.action.count)
+    for name, shape in shapes.items():
+        found = tuple(getattr(data, name).shape)
+        if found != shape or len(lead) != 3 or 0 in found[1:]:
             axes = "[episodes, steps, agents]" + (" and the width" if len(shape) > 3 else "")
             raise UserError(f"'{name}' of the transitions has shape {list(found)}; give {axes}: {list(shape)}")
     if len(data.obs) < FEWEST:
@@ -266,12 +261,6 @@ def _without_tails(reward: Tensor) -> Tensor:
     low, high = torch.quantile(reward.flatten()[: 1 << 24], torch.tensor([0.005, 0.995])).tolist()
     clamped = reward.clamp(low, high)
     return clamped if low < high and clamped.var() < (1 - _HIDES) * reward.var() else reward
-
-
-def _done(data: Transitions, spaces: Spaces) -> Tensor:
-    """Return actions as numbers [M, T, N, A], a discrete one as one for each choice."""
-    action = spaces.action
-    return F.one_hot(data.action, action.count).float() if isinstance(action, Discrete) else data.action
 
 
 def _shift(start: Tensor, turned: Tensor) -> float:

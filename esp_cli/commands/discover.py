@@ -63,7 +63,7 @@ def _discovery(
     what: str, task: str | None, transforms: str | None, settings: dict[str, object], logs: bool, seconds: float
 ) -> SymmetryReport:
     from esp_cli.checking import check_recorded, check_symmetry
-    from esp_cli.checking.logs import read_transitions
+    from esp_cli.checking.recorded import read_transitions
     from esp_cli.training.config import resolve_task_settings
     from esp_envs.registry import make
 

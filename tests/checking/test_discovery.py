@@ -21,9 +21,9 @@ from esp_cli.checking import (
     measured,
     named,
 )
-from esp_cli.checking.logs import read_transitions
 from esp_cli.checking.measured import prepared
 from esp_cli.checking.paired import _verdict
+from esp_cli.checking.recorded import read_transitions
 from esp_cli.checking.verdicts import LATE, ElementVerdict, FieldVerdict, Late, chance, concluded, verdicts_of
 from esp_cli.symmetry import Element, parse_elements, transform_set
 from esp_cli.training.build import build_learner
@@ -207,7 +207,7 @@ def test_a_file_of_transitions_is_judged_and_what_is_found_can_be_trained_with(t
         ({"reward": np.zeros((1536, 8, 2))}, "'reward' of"),
         ({"action": np.zeros((1536, 8, 3, 2), dtype=complex)}, "holds complex128"),
         ({"reward": np.full((1536, 8, 3), np.nan)}, "not finite"),
-        ({"reward": np.zeros((100, 8, 3))}, "different numbers of transitions"),
+        ({"reward": np.zeros((100, 8, 3))}, "'reward' of the transitions has shape [100, 8, 3]"),
         ({"obs": np.array([{}], dtype=object)}, "not an intact .npz file"),
     ],
 )
@@ -224,12 +224,15 @@ def test_what_is_no_file_run_or_task_is_refused(tmp_path: Path) -> None:
     assert "does not say what its numbers are; add --task" in refused("discover", recorded(tmp_path))
     navigation = ("--task", "navigation")
     assert "there is no file" in refused("discover", tmp_path / "none.npz", *navigation)
-    assert "'obs' of" in refused("discover", recorded(tmp_path, obs=np.zeros(64)), *navigation)
+    forces = ("--set", "task.actions=continuous")
+    assert "'obs' of" in refused("discover", recorded(tmp_path, obs=np.zeros(64)), *navigation, *forces)
     scalar = recorded(tmp_path, action=np.zeros((1536, 8, 3), int), action_mask=np.array(True))
     assert "'action_mask' of" in refused("discover", scalar, *navigation)
     nothing = {"obs": (1536, 0, 3, 14), "next_obs": (1536, 0, 3, 14), "action": (1536, 0, 3), "reward": (1536, 0, 3)}
     empty = {name: np.zeros(shape, int if name == "action" else float) for name, shape in nothing.items()}
-    assert "holds no number; record at least one step" in refused("discover", recorded(tmp_path, **empty), *navigation)
+    assert "'obs' of the transitions has shape [1536, 0, 3, 14]" in refused(
+        "discover", recorded(tmp_path, **empty), *navigation
+    )
     assert "unknown task 'nowhere'" in refused("discover", "nowhere")
     assert "there is no navigation; leave it out" in refused("discover", "navigation", "--task", "navigation")
     assert "is no run folder" in refused("discover", tmp_path, "--task", "navigation")

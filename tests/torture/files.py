@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 
 from esp_cli.app import app
 from esp_cli.checking import collect
-from esp_cli.checking.logs import read_transitions
+from esp_cli.checking.recorded import read_transitions
 from esp_cli.export.export import _refuse_mixture
 from esp_cli.files.documents import DocumentFormat, parse_object
 from esp_cli.policies.bundled import MANIFEST, MANIFEST_FORMAT, Manifest, bundled_folder
