@@ -11,7 +11,7 @@ import numpy as np
 from esp_cli.bodies import kinds
 from esp_cli.bodies.finding import Difference, Found, find
 from esp_cli.bodies.frame import Frame
-from esp_cli.bodies.parts import Parts, named_parts
+from esp_cli.bodies.kinds import Parts, named_parts
 from esp_cli.bodies.proof import NEARLY
 from esp_cli.bodies.reading import MOST_BODIES, MOST_MOVING, printable, quiet, read_model
 from esp_cli.symmetry.elements import Floats

@@ -79,18 +79,14 @@ class Frame:
 
     def carrier(self, body: int) -> int:
         """Return the moving body that a body hangs on; 0 is the world."""
-        parent = self.model.body_parentid[body]
-        while parent and not self.model.body_jntnum[parent]:
-            parent = self.model.body_parentid[parent]
-        return int(parent)
+        return int(self.model.body_weldid[self.model.body_parentid[body]])
 
     def _rigid_parts(self, com: Floats) -> tuple[Floats, Floats]:
         """Return [bodies] mass and [bodies, 3] middle of mass of each moving body with all that is fixed to it."""
-        mass, moment = np.zeros(self.model.nbody), np.zeros((self.model.nbody, 3))
-        for body in range(1, self.model.nbody):
-            owner = body if self.model.body_jntnum[body] else self.carrier(body)
-            mass[owner] += self.model.body_mass[body]
-            moment[owner] += self.model.body_mass[body] * com[body]
+        own, owner = self.model.body_mass, self.model.body_weldid
+        mass, moment = np.zeros(len(own)), np.zeros((len(own), 3))
+        np.add.at(mass, owner, own)
+        np.add.at(moment, owner, own[:, None] * com)
         return mass, moment / np.maximum(mass, 1e-12)[:, None]
 
     @cached_property

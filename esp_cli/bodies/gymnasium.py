@@ -24,8 +24,6 @@ from esp_envs.errors import UserError
 from esp_envs.installed import install
 from esp_envs.settings import TaskSettings
 
-mujoco.set_mju_user_warning(lambda _: None)  # by default warnings go to a file in the working directory
-
 
 class MujocoSettings(SingleAgentSettings):
     """Settings of these tasks."""

@@ -10,16 +10,13 @@ return {
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 from esp_cli.bodies.body import Body
 from esp_cli.bodies.kinds import PartsKind
 from esp_cli.symmetry.elements import Element, Floats
 from esp_cli.symmetry.plane import PlaneElement
 from esp_cli.symmetry.representation import layout_operator
 from esp_envs.errors import UserError
-from esp_envs.installed import import_named
+from esp_envs.installed import import_function
 from esp_envs.spec import Layout, layout
 
 ACTION = "action"
@@ -38,24 +35,12 @@ def numbers_of(body: Body, name: str | None) -> Numbers:
         joints = [body.positions(), body.velocities(), body.positions(name="actions")]
         seen = layout(body.velocity(), body.spin(), body.gravity(), body.command(), *joints)
         return {"policy": seen, ACTION: layout(body.positions(name="actions"))}
-    told = named_function(name)(body)
+    told = import_function(name)(body)
     if not isinstance(told, dict) or not all(isinstance(part, Layout) for part in told.values()) or ACTION not in told:
         raise UserError(
             f"{name} returns {type(told).__name__}; return layouts of observations by name, and of 'action'"
         )
     return told
-
-
-def named_function(name: str) -> Callable[..., Any]:
-    """Import "module:function", with the working directory first, as for a script.
-
-    Raises:
-        UserError: there is none.
-    """
-    found: Callable[..., Any] = import_named(name, "function", "function", "my_robot:mirror")
-    if not callable(found):
-        raise UserError(f"'{name}' is no function; check the name after the colon")
-    return found
 
 
 def map_of(numbers: Layout, element: PlaneElement) -> Floats:

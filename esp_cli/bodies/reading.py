@@ -13,6 +13,7 @@ import mujoco
 
 from esp_envs.errors import UserError
 
+mujoco.set_mju_user_warning(lambda _: None)  # by default they go to a file in the working directory
 XML_MIB, ASSET_MIB = 16, 256
 """Largest size of an XML file, and of a mesh or picture."""
 MOST_ELEMENTS, MOST_DEPTH, MOST_BODIES, MOST_MOVING = 50_000, 100, 1000, 200
@@ -66,21 +67,17 @@ def read_model(path: Path | str, root: Path | str | None = None, floating: bool 
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Keep MuJoCo from writing its warnings to a file in the working directory, and put its errors in a sentence.
+    """Keep warnings to itself, and put MuJoCo's errors in a sentence.
 
     Raises:
         UserError: it cannot go on, as where contacts take more memory than the model grants.
     """
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(lambda _: None)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
     except mujoco.FatalError as error:
         raise UserError(f"MuJoCo cannot simulate the model ({str(error).splitlines()[0]})") from None
-    finally:
-        mujoco.set_mju_user_warning(before)
 
 
 def _inspected(path: Path, allowed: Path) -> str:

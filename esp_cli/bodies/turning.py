@@ -15,11 +15,11 @@ import torch
 
 from esp_cli.bodies.body import Body
 from esp_cli.bodies.kinds import QUATERNION, QUATERNION_XYZW
-from esp_cli.bodies.numbers import ACTION, Numbers, labels_of, map_of, named_function
+from esp_cli.bodies.numbers import ACTION, Numbers, labels_of, map_of
 from esp_cli.files.opening import read_regular
 from esp_cli.symmetry.elements import Floats
 from esp_envs.errors import UserError
-from esp_envs.installed import install, last_line
+from esp_envs.installed import import_function, install, last_line
 from esp_envs.spec import Layout
 
 _ROWS, _MOST_BYTES = 2048, 1 << 30
@@ -82,7 +82,7 @@ def policy_of(name: str) -> Actor:
     """
     path = Path(name)
     if ":" in name and not path.exists():
-        return _of_tensors(named_function(name))
+        return _of_tensors(import_function(name))
     content = read_regular(path, _MOST_BYTES)
     if content is None:
         raise UserError(f"{path} has more than {_MOST_BYTES} bytes; give a policy")

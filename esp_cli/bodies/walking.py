@@ -138,11 +138,12 @@ class Quadruped(BatchedTask):
     def _observe(self, world: World) -> Tensor:
         angles, rates = world["positions"].flatten(2), 0.1 * world["velocities"].flatten(2)
         further = world["before"].flatten(2), world["clock"].flatten(2)
-        return torch.cat([*self._felt(world), angles, rates, *further], -1).unsqueeze(-2)
+        self._now = self._felt(world)
+        return torch.cat([*self._now, angles, rates, *further], -1).unsqueeze(-2)
 
     def _ended(self, world: World) -> Tensor:
         low = world["place"][..., 0, 2] < HEIGHT_M / 2
-        return low | (self._felt(world)[2][..., 2] > -0.5)  # or tilted by more than 60 degrees
+        return low | (self._now[2][..., 2] > -0.5)  # or tilted by more than 60 degrees
 
     def heuristic(self, name: str | None = None) -> Tensor:
         if self.named_heuristic(name) == "stand":

@@ -137,9 +137,10 @@ def _proof_of(out: Path) -> Path:
 
 def _audited(check: str, body: Body, numbers: str | None) -> list[Copy]:
     from esp_cli.bodies.auditing import audit
-    from esp_cli.bodies.numbers import named_function, numbers_of
+    from esp_cli.bodies.numbers import numbers_of
+    from esp_envs.installed import import_function
 
-    return audit(named_function(check), body, numbers_of(body, numbers))
+    return audit(import_function(check), body, numbers_of(body, numbers))
 
 
 def _measured(policy: str, rows: Path | None, body: Body, numbers: str | None) -> list[Turning]:

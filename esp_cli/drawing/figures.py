@@ -19,7 +19,7 @@ from matplotlib.patches import Circle, Rectangle
 from esp_cli.drawing.films import Mark, marks
 from esp_cli.drawing.recording import Episode
 from esp_cli.files.formatting import escaped
-from esp_envs.drawing import GRID, ink, trails
+from esp_envs.drawing import GRID, grid_lines, ink, trails
 from esp_envs.scene import DARK, Body, Scene, holders
 
 PAPER: dict[Any, Any] = {"font.size": 8, "legend.fontsize": 7, "pdf.fonttype": 42}
@@ -154,7 +154,7 @@ def _axes(axes: Axes, scene: Scene) -> Axes:
     if scene.grid[1]:  # lines between cells
         spacing, offset = scene.grid
         for low, high, lines in ((x_min, x_max, axes.set_xticks), (y_min, y_max, axes.set_yticks)):
-            lines(np.arange(math.ceil((low - offset) / spacing), (high - offset) / spacing + 1e-9) * spacing + offset)
+            lines(grid_lines(low, high, spacing, offset))
         axes.tick_params(length=0)
     axes.grid(color=GRID)
     axes.set_axisbelow(True)
@@ -200,21 +200,11 @@ def _add_body(axes: Axes, body: Body, small: bool = False) -> None:
     (x, y), r = body.position, body.radius
     if body.name and body.shape == "disc":
         on = 2 * r / np.ptp(axes.get_xlim()) * _width(axes.figure) / (_COLUMNS if small else 1) > _LEAST_LETTER
-        place: dict[str, Any] = {
-            "xytext": (0, 0) if on else (6, 6),
-            "textcoords": "offset points",
-            "ha": "center",
-            "va": "center",
-        }
         shift = 0.45 * r if on else 0.0  # crosses lie in the middle
-        axes.annotate(
-            body.name,
-            (x - shift, y - shift),
-            color=ink(body.color) if on else DARK,
-            fontsize="small",
-            zorder=6,
-            **place,
-        )
+        place, beside = (x - shift, y - shift), (0, 0) if on else (6, 6)
+        looks: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": "small", "zorder": 6}
+        color = ink(body.color) if on else DARK
+        axes.annotate(body.name, place, beside, textcoords="offset points", color=color, **looks)
     if body.shape == "cross":
         across, up = [x - r, x + r, np.nan, x - r, x + r], [y - r, y + r, np.nan, y + r, y - r]
         axes.plot(across, up, color="white", lw=4.5, zorder=5)

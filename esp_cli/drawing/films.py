@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from io import BytesIO
@@ -15,11 +15,10 @@ import numpy as np
 from imageio.v2 import get_writer
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
-from scipy.spatial import cKDTree
 
 from esp_cli.drawing.recording import Moment
 from esp_cli.files.writing import write_file
-from esp_envs.drawing import TopPainter, font
+from esp_envs.drawing import TopPainter, font, grid_lines
 from esp_envs.scene import DARK, Painter, Scene
 
 Frame = NDArray[np.uint8]
@@ -32,8 +31,6 @@ _OVERSAMPLING = 3
 _GAP = 8  # pixels between two pictures
 GIF_FRAMES_PER_SECOND = 50  # players slow down a GIF that is faster
 _GIF_TICK_S = 0.01
-_COLORS = 255  # colours of a GIF; one more marks what has not changed since the frame before
-_EXACT_COLORS = 64
 
 
 @dataclass(frozen=True)
@@ -92,20 +89,12 @@ def beside(pictures: Sequence[Frame], gap: int) -> Frame:
 
 def write_gif(path: Path, frames: Iterable[Frame], seconds: Sequence[float], sample: Sequence[Frame]) -> None:
     """Write frames [H, W, 3] of one size, each in view for some seconds, as an endless GIF in `sample`'s colours."""
-    palette = _palette(sample)
-    reduced = _reduced(frames, palette)
+    plain: dict[str, Any] = {"method": Image.Quantize.FASTOCTREE, "dither": Image.Dither.NONE}
+    palette = Image.fromarray(np.concatenate(sample)).quantize(**plain)
+    shown = (Image.fromarray(frame).quantize(palette=palette, **plain) for frame in frames)
     content = BytesIO()
-    next(reduced).save(
-        content,
-        "GIF",
-        save_all=True,
-        append_images=reduced,
-        duration=_milliseconds(seconds),
-        loop=0,
-        optimize=True,
-        transparency=_COLORS,
-        palette=palette.tobytes().ljust(3 * 256, b"\0"),
-    )
+    durations = _milliseconds(seconds)
+    next(shown).save(content, "GIF", save_all=True, append_images=shown, duration=durations, loop=0)
     write_file(path, content.getvalue())
 
 
@@ -202,8 +191,7 @@ def _ticks(low: float, high: float, spacing: float, scale: float, size: int) -> 
     step = spacing
     while step * scale < 3 * size:
         step *= 2
-    first, last = int(np.ceil(low / step - 1e-9)), int(np.floor(high / step + 1e-9))
-    return [k * step for k in range(first, last + 1)]
+    return grid_lines(low, high, step)
 
 
 def _milliseconds(seconds: Sequence[float]) -> list[int]:
@@ -215,37 +203,3 @@ def _milliseconds(seconds: Sequence[float]) -> list[int]:
         ticks.append(max(shortest, round(end) - shown))
         shown += ticks[-1]
     return [round(tick * _GIF_TICK_S * 1000) for tick in ticks]
-
-
-def _palette(sample: Sequence[Frame]) -> Frame:
-    """Return up to 255 colours for some frames: the most frequent as they are, the others by how they differ."""
-    codes, counts = np.unique(np.concatenate([_codes(frame).ravel() for frame in sample]), return_counts=True)
-    colors = _colors(codes[np.argsort(-counts, kind="stable")])
-    frequent, others = colors[:_EXACT_COLORS], colors[_EXACT_COLORS:]
-    if len(others):
-        grouped = Image.fromarray(others[None]).quantize(_COLORS - _EXACT_COLORS).getpalette() or []
-        others = np.array(grouped, dtype=np.uint8).reshape(-1, 3)[: _COLORS - _EXACT_COLORS]
-    return np.concatenate([frequent, others])
-
-
-def _reduced(frames: Iterable[Frame], palette: Frame) -> Iterator[Image.Image]:
-    """Yield each frame in the nearest colours of the palette (Pillow's own search is off by some levels)."""
-    nearest = cKDTree(palette.astype(np.float64))
-    table = np.full(1 << 24, -1, dtype=np.int16)  # of all colours, filled as they are met
-    for frame in frames:
-        codes = _codes(frame)
-        new = np.unique(codes[table[codes] < 0])
-        if len(new):
-            table[new] = nearest.query(_colors(new).astype(np.float64))[1]
-        image = Image.fromarray(table[codes].astype(np.uint8))
-        image.putpalette(palette.tobytes())
-        yield image
-
-
-def _codes(frame: Frame) -> NDArray[np.uint32]:
-    red, green, blue = np.moveaxis(frame.astype(np.uint32), -1, 0)
-    return red << 16 | green << 8 | blue
-
-
-def _colors(codes: NDArray[np.uint32]) -> Frame:
-    return np.stack([codes >> 16, codes >> 8 & 255, codes & 255], -1).astype(np.uint8)

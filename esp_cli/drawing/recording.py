@@ -56,9 +56,10 @@ def record(policies: Sequence[TrainedPolicy], episodes: int | None = None, greed
     for trained in policies:
         env = build_environment(trained.config.model_copy(update={"seeds": seeds}), 1, "film")
         controller = PolicyController(trained.policy, None if greedy else generators(seeds, "film", "noise"))
-        own: list[Episode] = []
-        while len(own) < episodes if episodes is not None else not _long_enough(own, env.spec.control_period_s):
+        own, seconds = list[Episode](), 0.0
+        while len(own) < episodes if episodes else seconds * (1 + 0.5 / max(1, len(own))) <= FILM_SECONDS:
             own.append(_play(controller, env))
+            seconds += own[-1].steps * env.spec.control_period_s + HOLD_SECONDS
         recorded.append(own)
         episodes = len(own)
     for together in zip(*recorded, strict=True):
@@ -69,13 +70,6 @@ def record(policies: Sequence[TrainedPolicy], episodes: int | None = None, greed
                 "compare policies whose task has the same settings"
             )
     return recorded
-
-
-def _long_enough(recorded: Sequence[Episode], period_s: float) -> bool:
-    if not recorded:
-        return False
-    seconds = sum(episode.steps * period_s + HOLD_SECONDS for episode in recorded)
-    return seconds + seconds / len(recorded) / 2 > FILM_SECONDS
 
 
 @torch.no_grad()
