@@ -164,13 +164,11 @@ def regular(group: FiniteGroup, copies: int) -> Block:
 
 def layout_blocks(layout: Layout, group: FiniteGroup) -> list[Block]:
     """Return one block per field of a layout: a copy is an item, or the whole field where its items change places."""
-    return [_field_block(field, group) for field in layout.fields]
-
-
-def _field_block(field: Field, group: FiniteGroup) -> Block:
-    if item_places(field, group.elements) is None:
-        return Block(item_operator(field, group.elements).matrix, field.count)
-    return Block(field_operator(field, group.elements).matrix, 1)
+    elements, moves = group.elements, [item_places(field, group.elements) is not None for field in layout.fields]
+    return [
+        Block(field_operator(f, elements).matrix, 1) if moved else Block(item_operator(f, elements).matrix, f.count)
+        for f, moved in zip(layout.fields, moves, strict=True)
+    ]
 
 
 def action_blocks(action: ActionSpace, group: FiniteGroup) -> list[Block]:

@@ -134,20 +134,13 @@ def _item(part: str, text: str, num_agents: int) -> tuple[Element, ...] | Group:
 
 def _factor(word: str, text: str, num_agents: int) -> Element | Group:
     """Read one word: an element or a group. Fields keep their capitals, and come after all other words."""
-    found = _read_word(word.lower(), num_agents)
+    read = (reader(word.lower(), num_agents) for reader in READERS)
+    found = next((one for one in read if one is not None), None)
     found = _read_items(word) if found is None else found
     if found is None:
         where = f" in '{shortened(text)}'" if word != text else ""
         raise UserError(f"unknown transform '{shortened(word)}'{where}; write for example {_KNOWN}")
-    return found
-
-
-def _read_word(word: str, num_agents: int) -> Element | Group | None:
-    """Read a word that is no order of items, in lower case; None where nothing knows it."""
-    for read in READERS:
-        if (found := read(word, num_agents)) is not None:
-            return found if isinstance(found, Group) else Element.of(found)
-    return None
+    return found if isinstance(found, Group) else Element.of(found)
 
 
 def _read_agents(word: str, num_agents: int) -> Element | Group | None:

@@ -230,15 +230,14 @@ class TransformSet:
             keep: by listed element (one number for a sampled group) how likely it is beside the others, 0 to 1. With
                 probability 1 - max(keep) the identity takes the place of the drawn one. Empty: all alike, and all stay.
         """
-        if self._group is not None:
-            return self._build([self._sampled(keep, g) for g in generators])
-        return self._picked([self._pick(keep, g) for g in generators])
-
-    def _sampled(self, keep: Sequence[float], generator: torch.Generator) -> Element:
-        assert self._group is not None
-        while (element := self._group.draw(generator)).is_identity:
-            pass
-        return element if not keep or _stays(keep[0], generator) else Element()
+        if self._group is None:
+            return self._picked([self._pick(keep, g) for g in generators])
+        elements = []
+        for generator in generators:
+            while (element := self._group.draw(generator)).is_identity:
+                pass
+            elements.append(element if not keep or _stays(keep[0], generator) else Element())
+        return self._build(elements)
 
     def _pick(self, keep: Sequence[float], generator: torch.Generator) -> int:
         """Draw an index by rejection; with equal weights the random stream equals the unweighted one."""
