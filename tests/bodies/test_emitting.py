@@ -20,10 +20,10 @@ from esp_cli.bodies.emitting import emitted
 from esp_cli.bodies.kinds import grid
 from esp_cli.bodies.numbers import ACTION, Numbers, map_of, numbers_of
 from esp_envs.errors import UserError
-from tests.bodies.models import QUADRUPED, biped
-from tests.bodies.test_deriving import GYMNASIUM
+from tests.bodies.models import biped
 from tests.bodies.test_fields import JOINTS, anymal
 from tests.cli.running import esp, refused
+from tests.torture.mirrors import ROBOTS, Mirrors
 
 
 def groups(body: Body) -> Numbers:
@@ -156,65 +156,14 @@ def test_the_audit_names_what_is_wrong_and_what_is_right():
     assert len(copy.wrong) == 4
 
 
-def robots() -> dict[str, Body]:
-    files = {name: Body.from_mjcf(GYMNASIUM / f"{name}.xml") for name in ("ant", "humanoid", "swimmer")}
-    texts = {"biped": biped(), "quadruped": QUADRUPED}
-    return (
-        files | {n: Body.from_mjcf(mujoco.MjModel.from_xml_string(t)) for n, t in texts.items()} | {"anymal": anymal()}
-    )
-
-
-def test_hundreds_of_wrong_mirrors_are_caught_and_relabelled_right_ones_never(tmp_path):
-    caught = 0
-    for body in robots().values():
-        order = [str(x) for x in np.random.default_rng(0).permutation(list(body.joints))]
-        fields = [body.velocity(), body.spin(), body.gravity(), body.attitude(), body.positions(order, history=3)]
-        if body.group != "d4":  # a grid that is no square does not turn by quarters
-            fields.append(body.scan(grid((2, 1), 0.5)))
-        numbers = {"policy": layout(*fields), ACTION: layout(body.positions(order))}
-        for element in body.elements[:3]:
-            right = map_of(numbers["policy"], element), map_of(numbers[ACTION], element)
-            assert verdict(*right, body, numbers) == []
-            for wrong in mistakes(*right, numbers["policy"]):
-                assert verdict(*wrong, body, numbers)
-                caught += 1
-    assert caught >= 300
-
-
-def verdict(seen: np.ndarray, acted: np.ndarray, body: Body, numbers) -> list:
-    L, K = torch.tensor(seen).float(), torch.tensor(acted).float()
-
-    def function(obs, actions):
-        return torch.cat([obs, obs @ L.T]), torch.cat([actions, actions @ K.T])
-
-    return [row for copy in audit(function, body, numbers) for row in copy.wrong]
-
-
-def mistakes(seen: np.ndarray, acted: np.ndarray, told):
-    """Yield maps with one mistake: signs, orders, polar for axial, quaternions, histories, scans."""
-    places = told.slices()
-    for k in range(len(acted)):
-        yield seen, acted * np.where(np.arange(len(acted)) == k, -1, 1)[:, None]
-        start = places["positions"].start + k
-        yield seen * np.where(np.arange(len(seen)) == start, -1, 1)[:, None], acted
-    for name in ("velocity", "spin", "attitude"):
-        part = places[name]
-        for change in (-1.0, None):
-            wrong = seen.copy()
-            wrong[part, part] = -wrong[part, part] if change else np.roll(wrong[part, part], 1, axis=0)
-            yield wrong, acted
-    swapped = seen.copy()
-    swapped[:6, :6] = 0
-    swapped[:3, :3], swapped[3:6, 3:6] = seen[3:6, 3:6], seen[:3, :3]
-    if not np.array_equal(swapped, seen):  # a turn does the same to both
-        yield swapped, acted
-    for part in (places["positions"], places.get("scan")):
-        if part is not None:
-            wrong = seen.copy()
-            wrong[part] = np.roll(wrong[part], 1, axis=0)
-            yield wrong, acted
-    if len(acted) > 1:
-        yield seen, np.roll(acted, 1, axis=0)
+def test_hundreds_of_wrong_mirrors_are_caught_and_relabelled_right_ones_never(tmp_path, monkeypatch):
+    mirrors = Mirrors(tmp_path, 0)
+    assert [mirrors.run(number) for number in range(27)] == [None] * 27
+    assert mirrors.count() == sum(mirrors.counts.values()) >= 300
+    assert {robot for robot, _ in mirrors.counts} == set(ROBOTS)
+    assert len({kind for _, kind in mirrors.counts}) == 14
+    monkeypatch.setattr("esp_cli.bodies.auditing._TOLERANCE", 10)
+    assert "a wrong sign of an action is taken" in mirrors.run(0), "the control: an audit that sees nothing"
 
 
 @pytest.mark.parametrize(

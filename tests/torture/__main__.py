@@ -1,7 +1,7 @@
 """An assault on the application that never ends by itself: kills, spoilt files, wrong command lines, hostile
-robots, odd data of foreign loops.
+robots, wrong mirrors, odd data of foreign loops.
 
-    python -m tests.torture --minutes 10 [--seed 0] [--part kills|files|lines|models|hosts] [--record FILE]
+    python -m tests.torture --minutes 10 [--seed 0] [--part kills|files|lines|models|mirrors|hosts] [--record FILE]
 
 Every case follows from the seed and its number alone, so that a finding is repeated by `--only NUMBER`. The record is a
 JSON file; the next call with the same file goes on where this one ended. The exit code is 1 if there are findings.
@@ -22,7 +22,7 @@ from pathlib import Path
 
 import torch
 
-from tests.torture import files, hosts, kills, lines, models
+from tests.torture import files, hosts, kills, lines, mirrors, models
 from tests.torture.record import Record
 
 PARTS = {
@@ -30,9 +30,10 @@ PARTS = {
     "kills": kills.Kills,
     "lines": lines.Lines,
     "models": models.Models,
+    "mirrors": mirrors.Mirrors,
     "hosts": hosts.Hosts,
 }
-SHARES = {"kills": 0.55, "files": 0.2, "lines": 0.12, "models": 0.1, "hosts": 0.03}
+SHARES = {"kills": 0.52, "files": 0.2, "lines": 0.12, "models": 0.1, "mirrors": 0.03, "hosts": 0.03}
 """Of the time; a kill takes longest."""
 
 
