@@ -1,11 +1,10 @@
-"""The kinds of layers that exports know, each with its form in C, ONNX and torch.
+"""The kinds of layers that exports know, each with its form in C and in torch, of which ONNX is made.
 
 A kind is a function here, an entry of `LAYERS` in `numpy_policy.py` and a function of `layers.c`.
 """
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,18 +27,16 @@ NORM_EPSILON = 1e-5  # layer normalisation adds this to the variance, as torch d
 class Layer:
     """One step of a program: rows x to rows y.
 
-    In C (in the macros of `templates/policy.c.jinja`) and ONNX (its text format, an operation a line) w0, w1, ... stand
-    for the arrays; in ONNX numbers stand for constants. `torch` makes y [rows, width] of x, the arrays, and the
-    observations [rows, D]; the kind `gru` takes the hidden state [rows, H] instead of the latter, `sets` the tables.
+    In C (in the macros of `templates/policy.c.jinja`) w0, w1, ... stand for the arrays. `torch` makes y [rows, width]
+    of x, the arrays, and the observations [rows, D]; the kind `gru` takes the hidden state [rows, H] instead of the
+    latter, `sets` the tables.
     """
 
     kind: str  # its name in JSON
     flops: int  # for one row: each addition, multiplication, comparison or call of tanh, exp or sqrt is one
     c: str
-    onnx: str
     torch: Callable[[Tensor, list[Tensor], Any], Tensor]
     arrays: tuple[Floats, ...] = ()  # learned numbers, in the order in which exports store them
-    onnx_arrays: tuple[Floats, ...] = ()  # what ONNX stores instead of them, where that differs
     numbers: tuple[tuple[str, object], ...] = ()  # what JSON says of it, beside the shapes of the arrays
     width: int = 0  # of the widest row that it reads or writes, where another layer does not tell
     scratch: int = 0  # numbers that C keeps beside rows
@@ -56,7 +53,6 @@ def affine(weight: Floats, bias: Floats) -> Layer:
         "affine",
         flops=2 * weight.size,
         c=f"EACH affine(w0, w1, {inputs}, {outputs}, X, Y);\nSWAP;",
-        onnx="y = Gemm(x, w0, w1)",
         torch=lambda x, w, _: torch.addmm(w[1], x, w[0]),
         arrays=(weight, bias),
         width=max(inputs, outputs),
@@ -69,7 +65,6 @@ def norm(weight: Floats, bias: Floats) -> Layer:
         "norm",
         flops=8 * weight.size,  # a number: sums for mean and variance (1 + 3), then four operations
         c=f"EACH normalise(w0, w1, {weight.size}, X);",
-        onnx="y = LayerNormalization<axis = -1, epsilon = 0.00001>(x, w0, w1)",
         torch=lambda x, w, _: F.layer_norm(x, x.shape[-1:], w[0], w[1], NORM_EPSILON),
         arrays=(weight, bias),
     )
@@ -81,7 +76,6 @@ def activation(kind: Literal["relu", "tanh"], width: int) -> Layer:
         kind,
         flops=width,
         c=f"EACH apply_{kind}(X, {width});",
-        onnx=f"y = {kind.capitalize()}(x)",
         torch=lambda x, *_: torch.relu(x) if kind == "relu" else torch.tanh(x),
         numbers=(("width", width),),
     )
@@ -110,21 +104,6 @@ def gru(weight: Floats, bias: Floats, hidden_weight: Floats, hidden_bias: Floats
             affine(w2, w3, {size}, 3 * {size}, memory, back);
             recur({size}, into, back, memory);
             memcpy(x, memory, sizeof(float) * {size});""",
-        onnx="""
-            p = Gemm(x, w0, w1)
-            q = Gemm(hidden, w2, w3)
-            pr, pz, pn = Split<axis = 1>(p)
-            qr, qz, qn = Split<axis = 1>(q)
-            r = Add(pr, qr)
-            reset = Sigmoid(r)
-            z = Add(pz, qz)
-            update = Sigmoid(z)
-            rq = Mul(reset, qn)
-            n = Add(pn, rq)
-            candidate = Tanh(n)
-            difference = Sub(hidden, candidate)
-            step = Mul(update, difference)
-            y = Add(candidate, step)""",
         torch=advance,
         arrays=(weight, bias, hidden_weight, hidden_bias),
     )
@@ -136,7 +115,6 @@ def cut(begin: int, end: int) -> Layer:
         "slice",
         flops=0,
         c=f"EACH memmove(X, X + {begin}, sizeof(float) * ({end} - {begin}));",
-        onnx=f"y = Slice(x, [{begin}], [{end}], [1])",
         torch=lambda x, *_: x[:, begin:end],
         numbers=(("begin", begin), ("end", end)),
     )
@@ -151,13 +129,8 @@ def convolution(weight: Floats, bias: Floats, shape: tuple[int, int, int], side:
         "convolution",
         flops=2 * weight.size * high * wide,
         c=f"EACH convolve(w0, w1, {channels}, {rows}, {columns}, {side}, {stride}, {outputs}, X, Y);\nSWAP;",
-        onnx=f"""
-            pictures = Reshape(x, [-1,{channels},{rows},{columns}])
-            filtered = Conv<strides = [{stride}, {stride}]>(pictures, w0, w1)
-            y = Reshape(filtered, [-1,{outputs * high * wide}])""",
         torch=lambda x, w, _: F.conv2d(x.unflatten(1, shape), w[0].T.reshape(filters), w[1], stride).flatten(1),
         arrays=(weight, bias),
-        onnx_arrays=(weight.T.reshape(filters), bias),
         numbers=(("channels", channels), ("rows", rows), ("columns", columns), ("side", side), ("stride", stride)),
         width=outputs * high * wide,
     )
@@ -174,9 +147,6 @@ def global_max_pool(channels: int, places: int) -> Layer:
         "global_max_pool",
         flops=channels * (places - 1),
         c=f"EACH global_max_pool({channels}, {places}, X, Y);\nSWAP;",
-        onnx=f"""
-            channels = Reshape(x, [-1,{channels},{places}])
-            y = ReduceMax<axes = [2], keepdims = 0>(channels)""",
         torch=lambda x, *_: x.unflatten(1, (channels, places)).amax(2),
         numbers=(("channels", channels), ("places", places)),
     )
@@ -204,25 +174,6 @@ def aggregate(begin: int, team: int, width: int, reach_squared: float) -> Layer:
         # per other agent: distance (3), comparison, count, and two operations per number of position and features
         flops=others * (9 + 2 * width) + 4,
         c=f"aggregate(observation + {begin}, {width}, {literal(reach_squared)}, {literal(reach)}, x, y);\nSWAP;",
-        onnx=f"""
-            positions = Slice(observation, [{begin}], [{begin + 2 * others}], [1])
-            ways = Reshape(positions, [-1,{others},2])
-            squares = Mul(ways, ways)
-            distances = ReduceSum(squares, [2])
-            within = Less(distances, {reach_squared})
-            near = Cast<to = 1>(within)
-            count = ReduceSum(near, [1])
-            divisor = Add(count, 1.0)
-            share = Div(near, divisor)
-            units = Div(ways, {reach})
-            shared_ways = Mul(share, units)
-            mean_way = ReduceSum<keepdims = 0>(shared_ways, [1])
-            worlds = Reshape(x, [-1,{team},{width}])
-            gathered = Gather<axis = 1>(worlds, {json.dumps(index, separators=(",", ":"))})
-            others = Reshape(gathered, [-1,{others},{width}])
-            shared = Mul(share, others)
-            message = ReduceSum<keepdims = 0>(shared, [1])
-            y = Concat<axis = 1>(x, mean_way, message)""",
         torch=hear,
         numbers=(("begin", begin), ("team", team), ("width", width), ("reach_squared", reach_squared)),
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -93,7 +92,6 @@ def pool_sets(
         "sets",
         flops=sum(2 * w.size for w in own) + of_things + sum(2 * each.arrays[1].size for each in sets),
         c=_c(sets, bool(own), kept, inputs, beside, near, kind),
-        onnx=_onnx(sets, bool(own), kept, inputs, near, kind.capitalize()),
         torch=pooled,
         arrays=(*own, *(array for each in sets for array in each.arrays)),
         numbers=(
@@ -166,84 +164,3 @@ def _c(
         array, column = array + 5, column + 2 * features
     lines += [f"memcpy(y + {column}, x + {inputs}, sizeof(float) * {beside});"] if beside else []
     return "\n".join(["{", *lines, "}", "SWAP;"])
-
-
-def _onnx(sets: Sequence[SetOf], embeds_own: bool, kept: Sequence[int], inputs: int, near: int, act: str) -> str:
-    """Return the ONNX of rows, in which `set_NAME` is a table [rows, things, W]."""
-    lines = [f"picked = Gather<axis = 1>(x, {_list(kept)})", f"rest = Slice(x, [{inputs}], [1000000], [1])"]
-    lines += ["summed = Gemm(picked, w0, w1)", f"own = {act}(summed)"] if embeds_own else ["own = Identity(picked)"]
-    located = [k for k, each in enumerate(sets) if each.place is not None]
-    tables = [f"set_{name}" for name in named([each.name for each in sets])]
-    for k in located:
-        lines += _placed(k, tables[k], sets[k], near)
-        tables[k] = f"near{k}" if near else tables[k]
-    if located:
-        farthest = ", ".join(f"far{k}" for k in located)
-        lines += [f"farthest = Max({farthest})", "none = Mul(farthest, 4.0)"]
-    array, pooled = 2 * embeds_own, list[str]()
-    for k, each in enumerate(sets):
-        w = [f"w{array + i}" for i in range(5)]
-        columns = [tables[k]]
-        if each.place is not None:
-            columns.append(f"distance{k}")
-            for j in located:
-                lines += _nearest(k, j)
-                columns.append(f"gap{k}_{j}")
-        lines += [
-            f"described{k} = Concat<axis = 2>({', '.join(columns)})",
-            f"product{k} = MatMul(described{k}, {w[0]})",
-            f"of_row{k} = Gemm(own, {w[1]}, {w[2]})",
-            f"shared{k} = Unsqueeze(of_row{k}, [1])",
-            f"sum{k} = Add(product{k}, shared{k})",
-            f"first{k} = {act}(sum{k})",
-            f"second{k} = MatMul(first{k}, {w[3]})",
-            f"biased{k} = Add(second{k}, {w[4]})",
-            f"embedded{k} = {act}(biased{k})",
-            f"mean{k} = ReduceMean<axes = [1], keepdims = 0>(embedded{k})",
-            f"maximum{k} = ReduceMax<axes = [1], keepdims = 0>(embedded{k})",
-        ]
-        array, pooled = array + 5, [*pooled, f"mean{k}", f"maximum{k}"]
-    return "\n".join([*lines, f"y = Concat<axis = 1>(own, {', '.join(pooled)}, rest)"])
-
-
-def _placed(k: int, table: str, each: SetOf, near: int) -> list[str]:
-    """Return the ONNX of a set's places and their distances, of the nearest things where `near` says so."""
-    lines, picked = [], f"[{each.place}], [{(each.place or 0) + 2}], [2]"
-    if near:
-        lines = [f"at{k} = Slice({table}, {picked})", f"way{k} = Identity(at{k})"]
-        if each.reader is not None:
-            lines = [lines[0], f"reader{k} = Slice(x, [{each.reader}], [{each.reader + 2}], [1])"]
-            lines += [f"here{k} = Unsqueeze(reader{k}, [1])", f"way{k} = Sub(at{k}, here{k})"]
-        lines += [
-            f"ways{k} = Mul(way{k}, way{k})",
-            f"length{k} = ReduceSum<keepdims = 0>(ways{k}, [2])",
-            f"count{k} = Shape<start = 1, end = 2>(length{k})",
-            f"most{k} = Min(count{k}, [{near}])",
-            f"shortest{k}, which{k} = TopK<axis = 1, largest = 0>(length{k}, most{k})",
-            f"index{k} = Unsqueeze(which{k}, [2])",
-            f"near{k} = GatherND<batch_dims = 1>({table}, index{k})",
-        ]
-        table = f"near{k}"
-    lines += [f"place{k} = Slice({table}, {picked})", f"pp{k} = Mul(place{k}, place{k})"]
-    lines += [f"square{k} = ReduceSum(pp{k}, [2])", f"distance{k} = Sqrt(square{k})"]
-    return [*lines, f"far{k} = ReduceMax<axes = [1], keepdims = 1>(square{k})"]
-
-
-def _nearest(k: int, j: int) -> list[str]:
-    """Return the ONNX of the distances between the things of set k and the nearest other of set j."""
-    name = f"{k}_{j}"
-    lines = [f"a{name} = Unsqueeze(place{k}, [2])", f"b{name} = Unsqueeze(place{j}, [1])"]
-    lines += [f"d{name} = Sub(a{name}, b{name})", f"dd{name} = Mul(d{name}, d{name})"]
-    lines += [f"apart{name} = ReduceSum<keepdims = 0>(dd{name}, [3])"]
-    others = f"apart{name}"
-    if k == j:
-        lines += [f"size{name} = Shape<start = 1, end = 3>(apart{name})", f"zeros{name} = ConstantOfShape(size{name})"]
-        lines += [f"ones{name} = EyeLike<k = 0>(zeros{name})", f"eye{name} = Cast<to = 9>(ones{name})"]
-        lines += [f"other{name} = Where(eye{name}, Infinity, apart{name})"]
-        others = f"other{name}"
-    lines += [f"least{name} = ReduceMin<axes = [2], keepdims = 1>({others})", f"alone{name} = IsInf(least{name})"]
-    return [*lines, f"found{name} = Where(alone{name}, none, least{name})", f"gap{name} = Sqrt(found{name})"]
-
-
-def _list(numbers: Sequence[int]) -> str:
-    return json.dumps(list(numbers), separators=(",", ":"))

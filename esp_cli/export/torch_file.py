@@ -64,8 +64,8 @@ def _squash(x: Tensor, groups: tuple[int, ...]) -> Tensor:
     return torch.cat([part * (torch.tanh(length) / length) for part, length in zip(parts, lengths, strict=True)], -1)
 
 
-def torch_archive(program: Program, description: str) -> bytes:
-    """Write a program as an archive of torch.export, for any number of rows, or of worlds for a team."""
+def exported_program(program: Program) -> torch.export.ExportedProgram:
+    """Return a program as a graph of plain operations, for any number of rows, or of worlds for a team."""
     worlds = torch.export.Dim("worlds", min=1)
     rows = worlds if program.team == 1 else program.team * worlds
     inputs = {"observation": torch.zeros(2 * program.team, program.num_inputs)}
@@ -79,9 +79,13 @@ def torch_archive(program: Program, description: str) -> bytes:
         widths = {name: len(columns[0]) for name, columns in program.sets}
         named["sets"] = {name: torch.zeros(2, 3 + k, width) for k, (name, width) in enumerate(widths.items())}
         shapes["sets"] = {name: {0: rows, 1: torch.export.Dim(f"things{k}")} for k, name in enumerate(widths)}
-    exported = torch.export.export(TorchProgram(program).eval(), arguments, named, dynamic_shapes=shapes)
+    return torch.export.export(TorchProgram(program).eval(), arguments, named, dynamic_shapes=shapes)
+
+
+def torch_archive(program: Program, description: str) -> bytes:
+    """Write a program as an archive of torch.export."""
     content = BytesIO()
-    torch.export.save(exported, content, extra_files={"policy.json": description})
+    torch.export.save(exported_program(program), content, extra_files={"policy.json": description})
     return content.getvalue()
 
 
