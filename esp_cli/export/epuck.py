@@ -1,32 +1,25 @@
-"""What stands beside an exported policy that drives e-pucks, in Python and C, and checks of it.
+"""Whether what stands beside an exported policy that drives e-pucks, `esp_epuck.py`, sees what the task shows.
 
 Untested on hardware. What builds an observation from poses is compared with the task in thousands of states.
 """
 
 from __future__ import annotations
 
-import ctypes
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from esp_cli.export.c_file import compiled, numbers
-from esp_cli.export.esp_epuck import FIELDS, PATIENCE_S, Pilot
-from esp_cli.export.layers import Floats, literal
-from esp_cli.export.templates import filled
+from esp_cli.export.esp_epuck import Pilot
+from esp_cli.export.layers import Floats
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training.build import build_environment
 from esp_envs.base import Environment
-from esp_envs.errors import UserError
 
 STATES = 10_000  # states on which the observations built from poses are compared with the task's
 TOLERANCE = 1e-5  # largest difference of an observation's number; float32 in metres gives 1e-6
-Observer = Callable[[Floats, Floats, Floats], Floats]
-"""(poses [N, 3], goals [N, 2], pillars [M, 2]) of one state to observations [N, D]."""
 _WORLDS = 100
 _JITTER_M = 0.001  # noise on the task's positions: in a perfect square two robots are equally near
 _EXACT = {"sensor_noise_m": 0.0, "heading_noise_rad": 0.0}  # of a robot's sensors in training, which poses do not show
@@ -41,33 +34,6 @@ def builds_observations(settings: Mapping[str, object]) -> bool:
 def seen_robots(settings: Mapping[str, Any]) -> int:
     """Return how many other robots an observation shows."""
     return min(settings["neighbours"], settings["num_agents"] - 1)
-
-
-def c_files(description: Mapping[str, Any]) -> dict[str, bytes]:
-    """Return header and source that build observations from poses and drive the wheels, by a policy without memory."""
-    robot, settings = description["robot"], description["task"]["settings"]
-    fields = [(field["field"], field["index"].partition("..")[0]) for field in description["observation"]]
-    names, nearness = {name for name, _ in fields}, settings["sight"] == "nearness"
-    if unknown := names - FIELDS:
-        raise UserError(f"poses do not tell what this policy sees: {', '.join(sorted(unknown))}")
-    body, unit, others = robot["body_radius_m"], settings["goal_sight_m"], seen_robots(settings)
-    values = {
-        "fields": fields,
-        "pairs": numbers([x for option in description["action"].get("options", ()) for x in option["means"]]),
-        "sees_bodies": bool({"obstacle", "robots"} & names),
-        "nearness": nearness,
-        "seen": others,
-        "team": others + 1,
-        "least_pillars": int("obstacle" in names and not nearness),
-        "period": literal(description["task"]["control_period_s"]),
-        "patience": literal(PATIENCE_S),
-        "pillar_reach": literal(settings["obstacle_radius_m"] + body),
-        "robot_reach": literal(2 * body),
-        "fading": literal(robot["fading_m"]),
-        "goal_unit": None if unit is None else literal(unit),
-        "max_speed": literal(robot["max_wheel_speed_rad_s"]),
-    }
-    return {name: filled(name, **values) for name in ("esp_epuck.h", "esp_epuck.c")}
 
 
 @dataclass(frozen=True)
@@ -119,35 +85,11 @@ def _probe(env: Environment, state: Floats, rng: np.random.Generator, near: bool
     return poses, items("goals"), items("obstacles"), obs
 
 
-def compare_scenes(scenes: Scenes, observe: Observer) -> float:
-    """Return the largest difference between the task's observations and those built from poses."""
-    built = [observe(*state) for state in zip(scenes.poses, scenes.goals, scenes.pillars, strict=True)]
-    gap = float(np.abs(np.stack(built) - scenes.observations).max())
+def compare_scenes(scenes: Scenes, description: dict[str, Any]) -> float:
+    """Return the largest difference between the task's observations and those that a pilot builds from poses."""
+    pilot = Pilot(description, lambda obs: obs)
+    states = zip(scenes.poses, scenes.goals, scenes.pillars, strict=True)
+    gap = float(np.abs(np.stack([pilot.observations(*state) for state in states]) - scenes.observations).max())
     if not gap <= TOLERANCE:
         raise RuntimeError(f"an observation built from poses differs from the task's by {gap:g}; this is a bug")
     return gap
-
-
-def python_observer(description: Mapping[str, Any]) -> Observer:
-    """Return what the Python controllers do."""
-    return Pilot(dict(description), lambda obs: obs).observations
-
-
-def c_observer(folder: Path, width: int) -> Observer:
-    """Compile esp_epuck.c and policy.c, and return what they do, robot by robot."""
-    code = compiled(folder / "esp_epuck.c", folder / "policy.c")
-
-    def observe(poses: Floats, goals: Floats, pillars: Floats) -> Floats:
-        obs = np.empty((len(poses), width), np.float32)
-        places, standing = _pointer(poses), _pointer(pillars)
-        for own, goal in enumerate(goals):
-            arguments = (places, len(poses), own, _pointer(goal), standing, len(pillars), _pointer(obs[own]))
-            if not code.esp_epuck_observe(*arguments):
-                raise RuntimeError("the exported C refuses a state of the task; this is a bug")
-        return obs
-
-    return observe
-
-
-def _pointer(array: Floats) -> Any:
-    return np.ascontiguousarray(array, np.float32).ctypes.data_as(ctypes.POINTER(ctypes.c_float))

@@ -54,7 +54,6 @@ class Format:
 
     write: Callable[[Job], Files]
     run: Callable[[Path, Program], Runner]  # makes what acts by the files in a folder
-    observer: Callable[[Path, Job], epuck.Observer] | None = None  # makes what builds observations from poses by them
 
 
 @dataclass(frozen=True)
@@ -83,9 +82,8 @@ def _c(job: Job) -> Files:
     example = job.description["example"]
     rows = (np.ravel(example.get(name, [])).tolist() for name in ("observation", "action", "action_mask"))
     sets = example.get("sets", {})
-    files = c_file.c_source(job.program, summary(job.trained, job.program))
-    files |= {"policy_example.c": c_file.example_source(job.program, sets, *rows)}
-    return files if job.scenes is None else files | epuck.c_files(job.description)
+    source = c_file.c_source(job.program, summary(job.trained, job.program))
+    return source | {"policy_example.c": c_file.example_source(job.program, sets, *rows)}
 
 
 def _numpy(job: Job) -> Files:
@@ -103,16 +101,8 @@ FORMATS = {
         lambda job: {"policy.pt2": torch_archive(job.program, json.dumps(job.description))},
         lambda folder, _: torch_runner(folder / "policy.pt2"),
     ),
-    "c": Format(
-        _c,
-        lambda folder, program: c_file.c_runner(folder / "policy.c", program),
-        lambda folder, job: epuck.c_observer(folder, job.program.num_inputs),
-    ),
-    "numpy": Format(
-        _numpy,
-        lambda folder, _: numpy_runner(folder / "policy.py"),
-        lambda _, job: epuck.python_observer(job.description),
-    ),
+    "c": Format(_c, lambda folder, program: c_file.c_runner(folder / "policy.c", program)),
+    "numpy": Format(_numpy, lambda folder, _: numpy_runner(folder / "policy.py")),
 }
 """The formats by name; `esp export` lists them without importing them, and -f policy beside them."""
 
@@ -137,7 +127,7 @@ def _job(trained: TrainedPolicy, formats: Sequence[str]) -> Job:
     program = program_of(trained.policy, trained.spec.masks)
     sample = take_sample(trained, program)
     description = describe(trained, program, sample)
-    drives = any(FORMATS[name].observer for name in formats) and not program.memory_width
+    drives = "numpy" in formats and not program.memory_width
     robotic = drives and "robot" in description and epuck.builds_observations(trained.spec.settings)
     return Job(trained, program, sample, description, epuck.take_scenes(trained) if robotic else None)
 
@@ -187,8 +177,8 @@ def _checked(name: str, files: Files, job: Job) -> Export:
         if name == "c" and not c_file.example_runs(folder):
             raise RuntimeError("the worked example of the exported C gives another action; this is a bug")
         seen = None
-        if job.scenes is not None and form.observer is not None:
-            seen = epuck.compare_scenes(job.scenes, form.observer(folder, job))
+        if job.scenes is not None and name == "numpy":
+            seen = epuck.compare_scenes(job.scenes, job.description)
     return Export(name, tuple(files), size, agreement, seen=seen)
 
 

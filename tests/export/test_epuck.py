@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import ctypes
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from esp_cli.export import c_file, check, epuck
+from esp_cli.export import check, epuck
 from esp_cli.export.esp_epuck import PATIENCE_S, Pilot
 from esp_cli.export.export import export
-from tests.export.policies import drawn_policy, imported
+from tests.export.policies import drawn_policy
 
-needs_cc = pytest.mark.skipif(c_file.compiler() is None, reason="needs a C compiler")
 SETTINGS = {
     "offset": {},
     "goal in its unit": {"goal_sight_m": 0.3},
@@ -24,9 +22,8 @@ SETTINGS = {
 }
 
 
-@needs_cc
 @pytest.mark.parametrize("case", SETTINGS)
-def test_c_and_python_see_from_poses_what_the_task_shows(
+def test_a_pilot_sees_from_poses_what_the_task_shows(
     case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     trained = drawn_policy("wheels", **SETTINGS[case])
@@ -36,11 +33,10 @@ def test_c_and_python_see_from_poses_what_the_task_shows(
     assert len(scenes.poses) == len(scenes.observations) == states
     assert len(np.unique(scenes.poses[:, 0, 0])) > 0.99 * states, "states differ"
     monkeypatch.setattr(epuck, "take_scenes", lambda trained: scenes)
-    results = export(trained, ["c", "numpy", "onnx"], tmp_path).formats
+    results = export(trained, ["numpy", "torch"], tmp_path).formats
     seen = {result.name: result.seen for result in results}
-    assert 0 < seen["c"] < epuck.TOLERANCE
     assert 0 < seen["numpy"] < epuck.TOLERANCE
-    assert seen["onnx"] is None
+    assert seen["torch"] is None
     assert (tmp_path / "esp_epuck.py").is_file()
     assert "Observations built from poses were compared" in (tmp_path / "README.md").read_text()
 
@@ -49,17 +45,17 @@ def test_an_observation_that_is_built_wrongly_is_found() -> None:
     trained = drawn_policy("wheels", sight="nearness")
     scenes = epuck.take_scenes(trained, 300)
     description = described(trained)
-    assert epuck.compare_scenes(scenes, epuck.python_observer(description)) < 1e-6
+    assert epuck.compare_scenes(scenes, description) < 1e-6
     for part, wrong in (("fading_m", 0.201), ("body_radius_m", 0.038)):
         spoilt = description | {"robot": description["robot"] | {part: wrong}}
         with pytest.raises(RuntimeError, match="differs from the task's"):
-            epuck.compare_scenes(scenes, epuck.python_observer(spoilt))
+            epuck.compare_scenes(scenes, spoilt)
     swapped = description | {"observation": description["observation"][::-1]}
     with pytest.raises(RuntimeError, match="differs from the task's"):
-        epuck.compare_scenes(scenes, epuck.python_observer(swapped))
+        epuck.compare_scenes(scenes, swapped)
     unseen = replace(scenes, observations=np.full_like(scenes.observations, np.nan))
     with pytest.raises(RuntimeError, match="differs from the task's by nan"):
-        epuck.compare_scenes(unseen, epuck.python_observer(description))
+        epuck.compare_scenes(unseen, description)
 
 
 def described(trained) -> dict:
@@ -74,8 +70,6 @@ def described(trained) -> dict:
 def test_what_poses_do_not_tell_is_refused() -> None:
     description = described(drawn_policy("wheels"))
     description["observation"] = [*description["observation"], {"field": "camera", "index": "8..9"}]
-    with pytest.raises(ValueError, match="poses do not tell what this policy sees: camera"):
-        epuck.c_files(description)
     with pytest.raises(ValueError, match="poses do not tell what this policy sees: camera"):
         Pilot(description, lambda obs: obs)
 
@@ -115,49 +109,7 @@ def test_a_team_stands_still_where_its_policy_says_no_number() -> None:
     assert not pilot.wheels(TEAM, GOALS, PILLARS).any()
 
 
-@pytest.fixture(scope="module", params=["wheels", "wheel pairs"])
-def compiled(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory):
-    """Return an exported policy as a compiled library, and its controller in Python."""
-    if c_file.compiler() is None:
-        pytest.skip("needs a C compiler")
-    folder, take = tmp_path_factory.mktemp("c"), epuck.take_scenes
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(epuck, "take_scenes", lambda trained: take(trained, 20))
-        export(drawn_policy(request.param), ["c", "numpy"], folder)
-    policy = imported(folder / "policy.py")
-    return c_file.compiled(folder / "esp_epuck.c", folder / "policy.c"), Pilot(policy.DESCRIPTION, policy.act)
-
-
-def driven(code: ctypes.CDLL, own: int, poses=TEAM, goals=GOALS, pillars=PILLARS, age_s=0.1, robots=3):
-    """Return what esp_epuck_drive returns, and both wheels."""
-    wheels = np.full(2, 7.0, np.float32)
-    arrays = [np.ascontiguousarray(a, np.float32) for a in (poses, goals[own], pillars)]
-    places, goal, standing, out = (a.ctypes.data_as(ctypes.POINTER(ctypes.c_float)) for a in (*arrays, wheels))
-    given = (places, robots, own, goal, standing, len(pillars), ctypes.c_float(age_s), out)
-    return code.esp_epuck_drive(*given), wheels.tolist()
-
-
-@pytest.mark.parametrize("own", [0, 1, 2])
-def test_the_c_controller_drives_as_the_python_controller_does(compiled, own: int) -> None:
-    code, pilot = compiled
-    answer, wheels = driven(code, own)
-    assert answer == 1
-    assert wheels == pytest.approx(pilot.wheels(TEAM, GOALS, PILLARS)[own].tolist(), abs=1e-4)
-    assert np.abs(wheels).max() > 0.01
-
-
-@pytest.mark.parametrize("case", UNSAFE)
-def test_a_robot_driven_by_c_stands_still_where_it_is_not_safe_to_drive(compiled, case: str) -> None:
-    assert driven(compiled[0], 0, **UNSAFE[case]) == (0, [0.0, 0.0])
-
-
-def test_a_robot_driven_by_c_needs_the_bodies_that_it_sees(compiled) -> None:
-    assert driven(compiled[0], 0, robots=1) == (0, [0.0, 0.0])
-    assert driven(compiled[0], 0, pillars=PILLARS[:0]) == (0, [0.0, 0.0]), "it sees the offset of a pillar"
-    assert driven(compiled[0], 0)[0] == 1
-
-
 def test_what_remembers_goes_out_without_poses(tmp_path: Path) -> None:
     trained = drawn_policy("point, recurrent")
-    assert "esp_epuck.c" not in export(trained, ["numpy"], tmp_path).formats[0].files
+    export(trained, ["numpy"], tmp_path)
     assert not (tmp_path / "esp_epuck.py").exists()
