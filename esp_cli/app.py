@@ -59,7 +59,8 @@ class LazyGroup(TyperGroup):
         """Run a command line; every failure that has a sentence becomes that sentence and its exit code."""
         extra["standalone_mode"] = False  # usage errors then come here instead of being printed in a box
         try:
-            _refuse_empty(sys.argv[1:] if args is None else args)
+            extra["obj"] = words = [*(sys.argv[1:] if args is None else args)]
+            _refuse_empty(words)
             _refuse_deleted_folder()
             code = super().main(args, prog_name or self.name, **extra)
         except (Exception, SystemExit) as failure:  # of the user's code: sys.exit is no end of a command

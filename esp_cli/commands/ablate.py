@@ -52,4 +52,4 @@ def ablate(
     names = parse_names(methods, KINDS[kind].variants)
     if settings and part != "breaking":
         raise UserError("--broken-by is for esp ablate breaking; leave it out")
-    run_or_forecast(kind, replace(choices.request(kind), variants=names, breakings=settings), choices)
+    run_or_forecast(kind, replace(choices.request(), variants=names, breakings=settings), choices)

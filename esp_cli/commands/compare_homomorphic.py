@@ -42,7 +42,7 @@ def compare_homomorphic(
     names = parse_names([methods]) if methods is not None else None
     limits = [] if threshold is None else [threshold]
     check_finite("--threshold", *limits)
-    request = choices.request("homomorphic")
+    request = choices.request()
     board = {"task.num_agents": drones, "task.width": grid, "task.height": grid}
     if twice := sorted(board.keys() & request.overrides.keys()):
         raise UserError(f"--drones and --grid say what {twice[0]} is; leave --set {twice[0]} out")

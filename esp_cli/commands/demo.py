@@ -13,7 +13,7 @@ from rich.text import Text
 from esp_cli import console
 from esp_cli.commands import options
 from esp_cli.commands.study_progress import StudyProgress
-from esp_cli.files.formatting import format_count, format_exactly
+from esp_cli.files.formatting import format_count
 
 if TYPE_CHECKING:
     from esp_cli.studies.run_set import Cell
@@ -31,6 +31,7 @@ _EVALUATIONS, _EPISODES, _FILM_EPISODES, _FILM_PIXELS = 10, 100, 3, 320
 
 
 def demo(
+    context: typer.Context,
     task: options.TaskOption = "predator-prey",
     steps: options.StepsOption = STEPS,
     seeds: options.SeedsOption = None,
@@ -49,26 +50,22 @@ def demo(
     from esp_cli.studies.engine import LocalEngine
     from esp_cli.studies.study import StudyFolder
 
-    study = _plan(task, steps, seeds or SEEDS, out, settings or [])
+    study = _plan(task, steps, seeds or SEEDS, options.command_line(context), settings or [])
     refuse_untrainable(study)
     with StudyFolder.held(out), stop_requests("stopping both runs after their iteration") as requests:
         folder = StudyFolder.create(out, study)
         resources = studying.Resources(LocalEngine(), 2, (), check=True)
         failed = studying.run_cells(folder, study, resources, requests, LiveCurves(folder))
     if requests:
-        console.note(f"stopped; go on with: {study.command}")
-        raise typer.Exit(130)
+        raise studying.stopped(study.command)
     studying.refuse_failed(failed, out)
     _show(folder)
 
 
-def _plan(task: str, steps: int, seeds: tuple[int, ...], out: Path, settings: list[str]) -> Study:
+def _plan(task: str, steps: int, seeds: tuple[int, ...], command: str, settings: list[str]) -> Study:
     from esp_cli.studies.catalogue import Request, plan
-    from esp_cli.training.config import seed_words
 
     options.register_named([task])
-    words = ["esp", "demo", "--task", task, "--steps", format_exactly(steps), *seed_words(seeds)]
-    words += [word for text in settings for word in ("--set", text)]
     every = {"evaluation.every_steps": max(1, steps // _EVALUATIONS)}
     request = Request(
         tasks=(task,),
@@ -76,7 +73,7 @@ def _plan(task: str, steps: int, seeds: tuple[int, ...], out: Path, settings: li
         seeds=seeds,
         overrides=every | options.parse_assignments(settings),
         episodes=_EPISODES,
-        command=shlex.join([*words, "--out", str(out)]),
+        command=command,
     )
     study = plan("ablate-prior", request)
     cells = tuple(cell.model_copy(update={"variant": LABELS[cell.config.prior.kind]}) for cell in study.cells)

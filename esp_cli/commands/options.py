@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+import shlex
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
@@ -72,6 +73,11 @@ def check_finite(option: str, *values: float) -> None:
     for value in values:
         if not math.isfinite(value):
             raise UserError(f"{option} {value} is not a finite number; write for example {option} -125")
+
+
+def command_line(context: typer.Context) -> str:
+    """Return the command line as it was typed."""
+    return shlex.join(["esp", *context.find_root().obj])
 
 
 def was_given(context: typer.Context, name: str | None) -> bool:

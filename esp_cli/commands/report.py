@@ -27,6 +27,7 @@ EPILOG = """Examples:\n
 
 
 def report(
+    context: typer.Context,
     runs: Annotated[
         list[str],
         typer.Argument(help="One study folder, or run folders, each as PATH or LABEL=PATH.", metavar="STUDY|RUN..."),
@@ -87,7 +88,7 @@ def report(
     else:
         if films and out is None:
             raise UserError("--films draws for the page that --out writes; add --out FOLDER, or leave it out")
-        material = _side_by_side(runs, at or [], limits, mode, out)
+        material = _side_by_side(runs, options.command_line(context), at or [], limits, mode)
 
     if csv is not None:
         from esp_cli.reporting.page import write_csv
@@ -121,7 +122,7 @@ def print_answer(material: Material, full: bool) -> None:
 
 
 def _side_by_side(
-    runs: Sequence[str], at: Sequence[str], thresholds: Sequence[float], mode: Mode | None, out: Path | None
+    runs: Sequence[str], command: str, at: Sequence[str], thresholds: Sequence[float], mode: Mode | None
 ) -> Material:
     from esp_cli.reporting.collect import collect_runs, read_curve
 
@@ -129,10 +130,7 @@ def _side_by_side(
     for text in runs:
         label, path = _labelled(text)
         curves.append(read_curve(path, label, mode or "greedy"))
-    first, *others = (curve.config for curve in curves)
-    words = ["esp", "report", *runs, *first.own_words(*others), *(word for text in at for word in ("--at", text))]
-    words += [*threshold_words(thresholds), *(["--mode", mode] if mode else []), *(["--out", str(out)] if out else [])]
-    return collect_runs(curves, shlex.join(words), mode or "greedy", steps, thresholds)
+    return collect_runs(curves, command, mode or "greedy", steps, thresholds)
 
 
 def _refuse_tuning(path: str) -> None:
@@ -143,11 +141,6 @@ def _refuse_tuning(path: str) -> None:
     if TUNING_FORMAT.is_one(Path(path) / TUNING):
         fresh = shlex.quote(str(Path(path) / FRESH))
         raise UserError(f"{path} is a tuning with a report of its own; report its study by: esp report {fresh}")
-
-
-def threshold_words(thresholds: Sequence[float]) -> list[str]:
-    """Return the words of the command line that name these thresholds."""
-    return [word for limit in thresholds for word in ("--threshold", repr(limit).removesuffix(".0"))]
 
 
 def _write_page(material: Material, out: Path | None, films: bool, style: Literal["screen", "paper"]) -> None:

@@ -25,4 +25,4 @@ def reproduce(
     choices: StudyChoices,
 ) -> None:
     """Train, evaluate and tabulate what a table of the paper shows; called again, it goes on where it was."""
-    run_or_forecast(table, choices.request(table), choices)
+    run_or_forecast(table, choices.request(), choices)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 import inspect
-import shlex
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
@@ -124,27 +123,17 @@ class StudyChoices:
     ] = None
     no_check: options.NoCheckOption = False
     json: options.JsonOption = None
-    words: Sequence[str] = field(init=False, default=())  # the command without these options: "reproduce", "table1"
+    command: str = field(init=False, default="")  # as it was typed
 
     def folder(self, kind: str) -> Path:
         return self.out or Path("runs") / kind
 
-    def running_words(self) -> str:
-        """Return the options that say how the study is run and not what, as the end of a command line."""
-        words = self._given("jobs", "reuse", "engine", "address", "gpu_share", "no_check")
-        return "".join(f" {shlex.quote(word)}" for word in words)
-
-    def _given(self, *names: str) -> list[str]:
-        shared = inspect.signature(StudyChoices, eval_str=True).parameters
-        return _words({name: shared[name] for name in names}, vars(self))
-
-    def request(self, kind: str) -> Request:
+    def request(self) -> Request:
         from esp_cli.machine import resolve_device
         from esp_cli.studies.catalogue import Request
 
         overrides = options.parse_assignments(self.settings or [])
         options.register_named(parse_names(self.tasks), parse_names(self.algos), [overrides.get("network.name")])
-        asked = self._given("tasks", "algos", "steps", "seeds", "seed_list", "preset", "settings", "device", "episodes")
         on_cluster = (self.engine, self.device) == ("ray", "cuda")  # whose GPU need not be here
         return Request(
             tasks=parse_names(self.tasks),
@@ -155,28 +144,8 @@ class StudyChoices:
             overrides=overrides,
             device="cuda" if on_cluster else resolve_device(self.device),
             episodes=self.episodes,
-            command=shlex.join(["esp", *self.words, *asked, "--out", str(self.folder(kind))]),
+            command=self.command,
         )
-
-
-def _words(parameters: Mapping[str, inspect.Parameter], values: Mapping[str, Any]) -> list[str]:
-    from esp_cli.training.config import seed_words
-
-    words = list[str]()
-    for name, parameter in parameters.items():
-        value, option = values[name], get_args(parameter.annotation)[1]
-        flags = [flag for flag in (option.default, *(option.param_decls or ())) if str(flag).startswith("-")]
-        if value == parameter.default:
-            continue
-        if name in ("seeds", "seed_list"):
-            words += seed_words(value)
-            continue
-        flag = [max(flags, key=len)] if flags else []
-        if value is True:
-            words += flag
-            continue
-        words += [word for item in (value if isinstance(value, list) else [value]) for word in (*flag, str(item))]
-    return words
 
 
 def study_command(command: Callable[..., None] | None = None, **helps: str) -> Callable[..., Any]:
@@ -191,13 +160,14 @@ def study_command(command: Callable[..., None] | None = None, **helps: str) -> C
     shared = dict(inspect.signature(StudyChoices, eval_str=True).parameters)
     for name, text in helps.items():
         shared[name] = shared[name].replace(annotation=_changed(shared[name].annotation, help=text))
-    parameters = sorted([*own.values(), *shared.values()], key=lambda one: one.default is not one.empty)
+    context = inspect.Parameter("context", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context)
+    parameters = sorted([context, *own.values(), *shared.values()], key=lambda one: one.default is not one.empty)
 
     @functools.wraps(command)
-    def with_options(**given: Any) -> None:
+    def with_options(context: typer.Context, **given: Any) -> None:
         arguments = {name: given.pop(name) for name in own}
         choices = StudyChoices(**given)
-        choices.words = [command.__name__.replace("_", "-"), *_words(own, arguments)]
+        choices.command = options.command_line(context)
         command(choices=choices, **arguments)
 
     with_options.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]

@@ -92,7 +92,7 @@ def run_study(
         folder = StudyFolder.create(out, study)
         failed = run_cells(folder, study, resources, requests)
     if requests:
-        raise stopped(study.command, choices)
+        raise stopped(choices.command)
     console.note(f"this took {console.format_duration(time.monotonic() - begun)}")
     report_study(folder, choices.json, mode, thresholds)
     refuse_failed(failed, out)
@@ -197,9 +197,9 @@ def follow(scheduler: Scheduler, requests: Sequence[int], progress: StudyProgres
     return [run.cell.name for run in scheduler.runs if run.status == "failed"]
 
 
-def stopped(command: str, choices: StudyChoices) -> typer.Exit:
+def stopped(command: str) -> typer.Exit:
     """Say how to go on with what the user stopped; return what ends the command."""
-    console.note(f"stopped; go on with: {command}{choices.running_words()}")
+    console.note(f"stopped; go on with: {command}")
     return typer.Exit(130)
 
 
@@ -217,11 +217,11 @@ def refuse_failed(names: Sequence[str], out: Path) -> None:
 
 def report_study(folder: StudyFolder, json: str | None, mode: Mode | None, thresholds: Sequence[float]) -> None:
     """Print the tables of a study and what came out, and say what to do next."""
-    from esp_cli.commands.report import print_answer, threshold_words
+    from esp_cli.commands.report import print_answer
     from esp_cli.reporting.collect import collect_study
 
     material = collect_study(folder, mode, thresholds)
     console.result(json, material.results.document(statistics=True), lambda: print_answer(material, full=True))
     first, *others = (cell.config for cell in folder.study.cells)
-    words = ["esp", "report", str(folder.path), *first.own_words(*others), *threshold_words(thresholds)]
-    console.note(f"next: {shlex.join(words)}")
+    limits = (word for limit in thresholds for word in ("--threshold", f"{limit:g}"))
+    console.note(f"next: {shlex.join(['esp', 'report', str(folder.path), *first.own_words(*others), *limits])}")

@@ -60,7 +60,7 @@ def tune(
     """Search for better settings; evaluate the best on fresh seeds. Called again, it goes on where it was."""
     priors = parse_names(prior) or ("esp",)
     check_finite("--reach", *(() if reach is None else (reach,)))
-    request = choices.request("tune")
+    request = choices.request()
     tuning = _tuning(request, priors, space, trial_seeds, budget=budget, goal=goal, reach=reach)
     idle = frozenset.intersection(*map(tuning.without_effect, priors))
     note_without_effect([name for name in tuning.overrides if name in idle])
@@ -145,7 +145,7 @@ def _tune(tuning: Tuning, request: Request, choices: StudyChoices) -> None:
             fresh = StudyFolder.create(judged, study)
             failed = studying.run_cells(fresh, study, resources, requests)
     if requests:
-        raise studying.stopped(tuning.command, choices)
+        raise studying.stopped(choices.command)
     if fresh is not None:
         studying.report_study(fresh, choices.json, None, () if tuning.reach is None else (tuning.reach,))
     studying.refuse_failed(failed, out)

@@ -5,10 +5,8 @@ Whatever a file or a command line brought into a text, no control character of i
 
 from __future__ import annotations
 
-import codecs
 import io
 import os
-import pydoc
 import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator
@@ -20,22 +18,6 @@ from rich.segment import Segment
 from rich.text import Text
 
 from esp_cli.files.formatting import escaped
-
-_IN_ASCII = {
-    "±": "+-",
-    "━": "=",
-    "╌": "-",
-    "→": "->",
-    "–": "-",
-    "…": "...",
-    "²": "2",
-    "●": "#",
-    "○": "o",
-    "│": "|",
-    "└": "+",
-    "─": "-",
-}
-"""What is written for a character that a terminal cannot show; a question mark for any other."""
 
 
 class SafeConsole(Console):
@@ -83,16 +65,10 @@ err = SafeConsole(file=_StandardError(), highlight=False)  # type: ignore[arg-ty
 
 
 def fit_encoding() -> None:
-    """Let standard output and error write something else for a character that their encoding does not have."""
-    codecs.register_error("esp.ascii", _in_ascii)
+    """Let standard output and error write a question mark for a character that their encoding does not have."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # nothing, where a descriptor is closed
-            stream.reconfigure(errors="esp.ascii")
-
-
-def _in_ascii(error: UnicodeError) -> tuple[str, int]:
-    assert isinstance(error, UnicodeEncodeError)
-    return "".join(_IN_ASCII.get(character, "?") for character in error.object[error.start : error.end]), error.end
+            stream.reconfigure(errors="replace")
 
 
 def say(text: str) -> None:
@@ -125,11 +101,6 @@ def paged() -> Iterator[None]:
     if not (out.is_terminal and sys.stdin.isatty()):
         yield
         return
-    with out.capture() as captured:
+    os.environ.setdefault("LESS", "-FRX")  # colours, nothing that fits the screen, and no empty screen behind it
+    with out.pager(styles=True):
         yield
-    text = captured.get()
-    if text.count("\n") < out.height:
-        out.file.write(text)
-    else:
-        os.environ.setdefault("LESS", "-FRX")  # colours, and no empty screen behind it
-        pydoc.pager(text)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import io
 import os
 import pty
 import re
@@ -183,23 +182,11 @@ def test_long_output_goes_through_the_pager_on_a_terminal() -> None:
     assert "PAGED" in on_terminal("settings", "mappo", PAGER="sed s/^/PAGED/")
 
 
-@pytest.mark.parametrize(("lines", "paged"), [(23, False), (24, True)])
-def test_what_fits_the_screen_is_not_paged(lines: int, paged: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    pages = list[str]()
-    terminal = Console(width=80, height=24, force_terminal=True, color_system=None, file=io.StringIO())
-    monkeypatch.setattr(streams, "out", terminal)
-    monkeypatch.setattr(streams.sys, "stdin", SimpleNamespace(isatty=lambda: True))
-    monkeypatch.setattr(streams.pydoc, "pager", pages.append)
-    with streams.paged():
-        terminal.print("\n".join(["line"] * lines))
-    assert [bool(pages), "line" in terminal.file.getvalue()] == [paged, not paged]
-
-
 def test_nothing_is_paged_in_a_pipe(monkeypatch: pytest.MonkeyPatch) -> None:
     def page(text: str) -> None:
         raise AssertionError("a pager would wait for a key")
 
-    monkeypatch.setattr(streams.pydoc, "pager", page)
+    monkeypatch.setattr("pydoc.pager", page)
     assert "learning_rate" in esp("settings", "mappo").stdout
 
 
