@@ -205,14 +205,12 @@ def stopped(command: str) -> typer.Exit:
 
 def refuse_failed(names: Sequence[str], out: Path) -> None:
     """End the command where runs of the study in a folder failed."""
-    if not names:
-        return
-    with_log = {path.parent.name for path in out.rglob(LOG)}  # a run that no machine could take has none
-    logged = [name for name in names if name in with_log]
-    whose = "their folders" if len(logged) == len(names) else f"the folders of {', '.join(logged)}"
-    see = f" see {LOG} in {whose} below {out};" if logged else ""
-    runs = "run" if len(names) == 1 else "runs"
-    raise UserError(f"{len(names)} {runs} failed ({', '.join(names)});{see} the same command tries them again")
+    if names:
+        runs = "run" if len(names) == 1 else "runs"
+        raise UserError(
+            f"{len(names)} {runs} failed ({', '.join(names)}); what was said of them is above, and in {LOG} of their "
+            f"folders below {out}; the same command tries them again"
+        )
 
 
 def report_study(folder: StudyFolder, json: str | None, mode: Mode | None, thresholds: Sequence[float]) -> None:

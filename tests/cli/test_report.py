@@ -114,7 +114,9 @@ def test_page_markdown_results_and_terminal_compare_at_the_same_step(
         assert shown in text
         assert "navigation, 100" in text
     assert f"| navigation, 100 | ESP | 150 | {shown} |" in markdown
-    command = shlex.join(["esp", "report", f"short={short}", f"ESP={finished}", "--out", str(out)])
+    command = shlex.join(
+        ["esp", "report", f"short={short}", f"ESP={finished}", "--out", str(out), "--results", str(small)]
+    )
     assert f"```sh\n{command}\n```" in markdown
     assert "'" in command, "a path with a space is quoted"
     at = esp("report", f"short={short}", f"ESP={finished}", "--at", "50", "--mode", "stochastic", "--out", out)
