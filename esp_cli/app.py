@@ -12,7 +12,7 @@ import re
 import sys
 from collections.abc import Sequence
 from importlib import import_module
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
@@ -24,9 +24,6 @@ from esp_cli.defaults import __version__
 from esp_cli.files import formatting
 from esp_cli.files.formatting import did_you_mean
 from esp_envs.errors import UserError
-
-if TYPE_CHECKING:
-    from pydantic import ValidationError
 
 _HELP_NAMES = {"help_option_names": ["-h", "--help"]}
 _OTHER_NAMES = {
@@ -119,10 +116,8 @@ def report(failure: Exception | SystemExit) -> int | None:
     if isinstance(failure, typer.Abort):
         console.note("aborted")
         return EXIT_MACHINE
-    # of pydantic, told apart without importing it
-    refused = type(failure).__module__.startswith("pydantic") and hasattr(failure, "errors")
-    if isinstance(failure, UserError) or refused:
-        console.error(_sentence(cast("UserError | ValidationError", failure)))
+    if isinstance(failure, UserError):
+        console.error(str(failure) or type(failure).__name__)
         return EXIT_USER
     if isinstance(failure, OSError) and failure.errno is not None:
         console.error(formatting.sentence(failure))
@@ -133,19 +128,6 @@ def report(failure: Exception | SystemExit) -> int | None:
         return None
     console.error(f"your code raises in {place}: {installed.last_line(failure)}; ESP_TRACEBACK=1 shows the traceback")
     return EXIT_USER
-
-
-def _sentence(failure: UserError | ValidationError) -> str:
-    """Return the message in one line; what pydantic found wrong is listed by setting."""
-    if isinstance(failure, UserError):
-        return str(failure) or type(failure).__name__
-    found = []
-    for item in failure.errors(include_url=False):
-        where = ".".join(str(part) for part in item["loc"])
-        message = formatting.own_words(item["msg"])
-        told = f"setting '{where}': {message} (got {item['input']!r})" if where else message
-        found.append(f"there is no setting '{where}'" if item["type"] == "extra_forbidden" else told)
-    return f"{failure.title}: {'; '.join(found)}"
 
 
 app = typer.Typer(

@@ -14,6 +14,7 @@ from esp_cli.defaults import EPISODES
 if TYPE_CHECKING:
     from esp_cli.policies.evaluation import FinalEvaluation
     from esp_cli.policies.loading import TrainedPolicy
+    from esp_cli.policies.statistics import EpisodeSpread, SeedSummary
 
 _AGENT_STEPS = 100_000  # of each policy, beyond which fewer episodes are played
 EPILOG = """Examples:\n
@@ -70,31 +71,17 @@ def _default(trained: TrainedPolicy) -> int:
 def _print(result: FinalEvaluation, policy: str) -> None:
     from esp_cli.policies.statistics import normalised
 
-    rows = []
+    def row(label: str, mean: float | None, error: SeedSummary | EpisodeSpread) -> tuple[str, ...]:
+        scaled = None if mean is None else normalised(mean, result.anchors)
+        score = "-" if scaled is None else f"{scaled:.2f}"
+        return label, console.format_mean(mean, error.sem), console.format_interval(error.ci95), score
 
-    def score(value: float | None) -> str:
-        scaled = None if value is None else normalised(value, result.anchors)
-        return "-" if scaled is None else f"{scaled:.2f}"
-
-    for mode in ("greedy", "stochastic"):
-        returns = result.returns(mode)
-        error = result.over_episodes.get(mode, returns)  # of one seed that stopped there is neither
-        rows.append(
-            (
-                mode,
-                console.format_mean(returns.mean, error.sem),
-                console.format_interval(error.ci95),
-                score(returns.mean),
-            )
-        )
-    first = "".join(result.heuristics[:1])
-    names = {"random": "random", "heuristic": f"heuristic {first}"}
+    names = {"random": "random", "heuristic": f"heuristic {''.join(result.heuristics[:1])}"}
     names = {key: names.get(key, f"heuristic {key}") for key in result.anchors}
-    for key, value in result.anchors.items():
-        error = result.over_episodes[key]
-        rows.append(
-            (names[key], console.format_mean(value, error.sem), console.format_interval(error.ci95), score(value))
-        )
+    policies = {"greedy": result.greedy, "stochastic": result.stochastic}
+    # of one seed the error is over episodes; of one that stopped there is neither
+    rows = [row(mode, own.mean, result.over_episodes.get(mode, own)) for mode, own in policies.items()]
+    rows += [row(names[key], value, result.over_episodes[key]) for key, value in result.anchors.items()]
     title = (
         f"{policy} on {result.task} version {result.task_version} after {console.format_count(result.step)} steps, "
         f"{len(result.seeds)} seed(s) x {result.episodes} episodes"

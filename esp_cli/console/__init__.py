@@ -7,11 +7,10 @@ notes, errors) goes to standard error, so that `esp eval RUN --json - | jq` sees
 from __future__ import annotations
 
 import json
-import math
 import sys
 import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, is_dataclass
+from collections.abc import Callable, Iterable, Sequence
+from operator import methodcaller
 from pathlib import Path
 
 from rich import box
@@ -102,30 +101,13 @@ def write_json(path: str | Path, value: object) -> None:
     Numbers that JSON does not know (NaN, infinities) become null; arrays, tensors, dataclasses, models and paths are
     taken too. See `write_file` for links and devices.
     """
+    from pydantic_core import to_jsonable_python  # noqa: PLC0415 - which no help needs
+
+    plain = to_jsonable_python(value, inf_nan_mode="null", fallback=methodcaller("tolist"))
     shown = str(path) == "-"  # in ASCII, which every terminal shows and no control character leaves
-    text = json.dumps(_plain(value), indent=2, ensure_ascii=shown, allow_nan=False) + "\n"
+    text = json.dumps(plain, indent=2, ensure_ascii=shown, allow_nan=False) + "\n"
     if shown:
         sys.stdout.write(text)
         sys.stdout.flush()
         return
     write_file(path, text.encode())
-
-
-def _plain(value: object) -> object:
-    if value is None or isinstance(value, bool | int | str):
-        return value
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple | set | frozenset):
-        return [_plain(item) for item in value]
-    if isinstance(value, Path):
-        return str(value)
-    if is_dataclass(value) and not isinstance(value, type):
-        return _plain(asdict(value))
-    for method in ("model_dump", "tolist"):  # pydantic models; arrays and tensors
-        convert = getattr(value, method, None)
-        if callable(convert):
-            return _plain(convert())
-    raise TypeError(f"{type(value).__name__} has no place in JSON")

@@ -12,10 +12,10 @@ import torch
 from esp_cli.defaults import __version__
 from esp_cli.files.opening import taking_turns
 from esp_cli.policies.bundled import NAME_PATTERN, Entry, Score, read_bundled, standard_name, write_bundled
-from esp_cli.policies.evaluation import play_batches, play_references
+from esp_cli.policies.evaluation import evaluate, play_batches
 from esp_cli.policies.loading import TrainedPolicy
-from esp_cli.policies.statistics import normalised, spread_over_episodes
-from esp_cli.training.build import Episodes, PolicyController, build_environment
+from esp_cli.policies.statistics import EpisodeSpread, normalised
+from esp_cli.training.build import PolicyController
 from esp_cli.training.checkpoint import describe_policy, write_policy
 from esp_cli.training.folder_names import CONFIG
 from esp_envs.errors import UserError
@@ -25,32 +25,10 @@ def best_seed(trained: TrainedPolicy, episodes: int) -> int:
     """Return the seed with the largest mean greedy return over episodes that no evaluation uses."""
     if len(trained.config.seeds) == 1:
         return trained.config.seeds[0]
-    returns = play_batches(trained, PolicyController(trained.policy), "selection", episodes).returns.mean(1)
+    returns = play_batches(trained.config, PolicyController(trained.policy), "selection", episodes).returns.mean(1)
     if len(trained.stopped) < len(returns):
         returns[list(trained.stopped)] = -torch.inf
     return trained.config.seeds[int(returns.argmax())]
-
-
-def score_of(episodes: Episodes) -> Score:
-    """Return mean, standard error and 95 % interval over the episodes of one seed."""
-    returns = episodes.returns[0].double().numpy()
-    spread = spread_over_episodes(returns)
-    if spread.sem is None or spread.ci95 is None:
-        raise UserError("these episodes all brought the same return, or there is only one; a score needs more of them")
-    return Score(mean=float(returns.mean()), sem=spread.sem, ci95=spread.ci95, episodes=returns.size)
-
-
-def normalised_of(own: TrainedPolicy, score: Score) -> float | None:
-    """Return a score between those of the random policy, 0, and of the best heuristic, 1, on as many episodes."""
-    names = build_environment(own.config, 1, "shape").heuristics
-    played = play_references(own.config, names, score.episodes)
-    scaled = normalised(score.mean, {name: float(episodes.returns.mean()) for name, episodes in played.items()})
-    return None if scaled is None else float(scaled)
-
-
-def play_greedily(trained: TrainedPolicy, episodes: int) -> Episodes:
-    """Play the episodes of one seed's policy that `esp eval` plays too."""
-    return play_batches(trained, PolicyController(trained.policy), "greedy", episodes)
 
 
 def bundle(
@@ -68,8 +46,14 @@ def bundle(
         raise UserError(f"'{name}' is not a valid policy name; write words of a-z and 0-9 with - between them")
     _others(folder, name, force)  # before the episodes are played; they take minutes
     own = trained.single_seed(best_seed(trained, episodes) if seed is None else seed)
-    played = play_greedily(own, episodes)
-    score = score_of(played)
+    found = evaluate(own, episodes)
+    spread = found.over_episodes.get("greedy", EpisodeSpread(None, None))
+    if found.greedy.mean is None or spread.sem is None or spread.ci95 is None:
+        raise UserError(
+            "these episodes all brought the same return, or this seed stopped; take more of them, or another"
+        )
+    score = Score(mean=found.greedy.mean, sem=spread.sem, ci95=spread.ci95, episodes=episodes)
+    scaled = normalised(score.mean, found.anchors)
     folder.mkdir(parents=True, exist_ok=True)
     with taking_turns(folder):
         others = _others(folder, name, force)  # again: another export may have added its policy meanwhile
@@ -88,8 +72,8 @@ def bundle(
             chosen_from=len(config.seeds),
             step=own.step,
             score=score,
-            normalised=normalised_of(own, score),
-            metrics={key: float(value.mean()) for key, value in played.metrics.items()},
+            normalised=None if scaled is None else float(scaled),
+            metrics={name: value for name, value in found.metrics.items() if value is not None},
             command=config.command(),
             esp_version=__version__,
             config=config.model_dump(mode="json"),

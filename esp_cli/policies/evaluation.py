@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
-from esp_cli.defaults import Mode, __version__
+from esp_cli.defaults import __version__
 from esp_cli.networks.policy import Policy
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.policies.statistics import EpisodeSpread, SeedSummary, spread_over_episodes, summarise
@@ -60,9 +60,6 @@ class FinalEvaluation(BaseModel):
     flops_per_action: float | None = None  # of the matrix products behind one agent's action
     over_episodes: dict[str, EpisodeSpread] = {}  # of each reference policy, and of one seed's greedy and stochastic
 
-    def returns(self, mode: Mode) -> SeedSummary:
-        return self.greedy if mode == "greedy" else self.stochastic
-
 
 def evaluate(trained: TrainedPolicy, episodes: int) -> FinalEvaluation:
     """Play `episodes` episodes per seed with the greedy and the stochastic policy, and with each reference policy.
@@ -72,9 +69,9 @@ def evaluate(trained: TrainedPolicy, episodes: int) -> FinalEvaluation:
     if episodes < 1:
         raise UserError(f"episodes is {episodes}; play at least one")
     seeds = trained.config.seeds
-    greedy = play_batches(trained, PolicyController(trained.policy), "greedy", episodes)
+    greedy = play_batches(trained.config, PolicyController(trained.policy), "greedy", episodes)
     drawn = PolicyController(trained.policy, generators(seeds, _STREAM, "noise"))
-    stochastic = play_batches(trained, drawn, "stochastic", episodes)
+    stochastic = play_batches(trained.config, drawn, "stochastic", episodes)
     for played in (greedy, stochastic):
         for numbers in (played.returns, *played.metrics.values()):
             numbers[list(trained.stopped)] = float("nan")
@@ -108,9 +105,9 @@ def evaluate(trained: TrainedPolicy, episodes: int) -> FinalEvaluation:
 
 def play_references(config: RunConfig, names: Sequence[str], episodes: int) -> dict[str, Episodes]:
     """Play the random policy and the task's heuristics: "random", "heuristic" for the first, others by name."""
-    anchors = {"random": _play(config, ScriptedController(methodcaller("random_action")), "random", episodes)}
+    anchors = {"random": play_batches(config, ScriptedController(methodcaller("random_action")), "random", episodes)}
     for key, name in zip(("heuristic", *names[1:]), names, strict=False):
-        anchors[key] = _play(config, ScriptedController(methodcaller("heuristic", name)), "heuristic", episodes)
+        anchors[key] = play_batches(config, ScriptedController(methodcaller("heuristic", name)), "heuristic", episodes)
     return anchors
 
 
@@ -159,12 +156,8 @@ def _means(episodes: Episodes) -> Metrics:
     return {name: float(value.mean()) for name, value in known.items() if value.numel()}
 
 
-def play_batches(trained: TrainedPolicy, controller: Controller, stream: str, episodes: int) -> Episodes:
+def play_batches(config: RunConfig, controller: Controller, stream: str, episodes: int) -> Episodes:
     """Play episodes (so many per seed) in batches whose worlds depend on the seeds, the stream and the batch alone."""
-    return _play(trained.config, controller, stream, episodes)
-
-
-def _play(config: RunConfig, controller: Controller, stream: str, episodes: int) -> Episodes:
     parts = []
     batch = max(1, min(episodes, MAX_WORLDS // len(config.seeds)))
     for begin in range(0, episodes, batch):

@@ -14,7 +14,6 @@ from typing import Annotated
 
 import pytest
 import typer
-from pydantic import BaseModel, ConfigDict, Field
 from typer.testing import CliRunner
 
 from esp_cli import __version__
@@ -25,11 +24,6 @@ from esp_envs.errors import UserError
 
 ROOT = Path(__file__).parents[2]
 runner = CliRunner()
-
-
-class ToySettings(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-    learning_rate: float = Field(1e-3, gt=0)
 
 
 FAILURES: dict[str, BaseException] = {
@@ -51,8 +45,6 @@ def toy(
     seeds: SeedsOption = (0,),
 ) -> None:
     """Fail in the way that is asked for."""
-    if kind == "settings":
-        ToySettings.model_validate({"learning_rate": -1, "speed": 3})
     if kind in FAILURES:
         raise FAILURES[kind]
     typer.echo(f"{kind} {steps} {seeds}")
@@ -77,12 +69,6 @@ def test_a_command_gets_its_parsed_arguments(commands: None) -> None:
     ("kind", "code", "sentence"),
     [
         ("value", 2, "error: task 'x' has no symmetry; choose another"),
-        (
-            "settings",
-            2,
-            "error: ToySettings: setting 'learning_rate': Input should be greater than 0 (got -1); "
-            "there is no setting 'speed'",
-        ),
         ("interrupt", 130, "interrupted"),
         ("missing", 2, "error: no such file or directory: runs/a; check the path and its permissions"),
         ("denied", 2, "error: permission denied: runs/b; check the path and its permissions"),

@@ -10,20 +10,19 @@ import shutil
 import threading
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
-import torch
 
 from esp_cli.commands.counts import parse_count, parse_seeds
 from esp_cli.commands.options import parse_assignments
 from esp_cli.files.opening import taking_turns
 from esp_cli.policies import bundled, bundling
-from esp_cli.policies.bundled import MANIFEST, Entry, Score, bundled_folder, find, read_bundled, standard_name
-from esp_cli.policies.bundling import best_seed, bundle, normalised_of, play_greedily, score_of
-from esp_cli.policies.evaluation import evaluate
+from esp_cli.policies.bundled import MANIFEST, Entry, bundled_folder, find, read_bundled, standard_name
+from esp_cli.policies.bundling import best_seed, bundle
+from esp_cli.policies.evaluation import FinalEvaluation, evaluate, play_batches
 from esp_cli.policies.loading import TrainedPolicy, load_entry, open_policy
-from esp_cli.training.build import Episodes
+from esp_cli.policies.statistics import mean_and_sem, normalised
+from esp_cli.training.build import PolicyController
 from esp_cli.training.config import RunConfig, resolve_config, resolve_task_settings
 from tests.export.policies import drawn_policy
 
@@ -38,12 +37,13 @@ def test_a_policy_does_what_its_manifest_says(entry: Entry) -> None:
     assert hashlib.sha256(file.read_bytes()).hexdigest() == entry.sha256
     trained = load_entry(entry)
     assert (trained.spec.version, trained.spec.convention) == (entry.task_version, entry.convention)
-    played = play_greedily(trained, EPISODES.get(entry.task, 128))
-    score = score_of(played)
+    controller = PolicyController(trained.policy)
+    played = play_batches(trained.config, controller, "greedy", EPISODES.get(entry.task, 128))
+    mean, sem = mean_and_sem(played.returns[0])
     # Four standard errors of the difference: these are the first of the manifest's own episodes, on which another
     # machine's rounding may let a few go otherwise.
-    error = math.hypot(score.sem, entry.score.sem)
-    assert abs(score.mean - entry.score.mean) < 4 * error
+    error = math.hypot(sem, entry.score.sem)
+    assert abs(mean - entry.score.mean) < 4 * error
     assert entry.score.ci95[0] <= entry.score.mean <= entry.score.ci95[1]
     assert set(played.metrics) >= set(entry.metrics), "later versions may measure more"
 
@@ -118,8 +118,9 @@ def test_what_is_put_in_is_found_and_plays_the_same(small: Path) -> None:
     assert (entry.chosen_from, entry.score.episodes, entry.step) == (2, 4, 100)
     trained = load_entry(entry)
     assert trained.config.seeds == (entry.seed,)
-    assert score_of(play_greedily(trained, 4)) == entry.score
-    assert evaluate(trained, 4).greedy.mean == pytest.approx(entry.score.mean)
+    found = evaluate(trained, 4)
+    assert found.greedy.mean == pytest.approx(entry.score.mean)
+    assert entry.normalised == pytest.approx(float(normalised(entry.score.mean, found.anchors)))
 
 
 def test_the_seed_is_the_one_that_did_best(small: Path) -> None:
@@ -200,12 +201,12 @@ def test_files_of_others_are_left_alone(tmp_path: Path) -> None:
 
 
 def test_a_policy_that_another_export_adds_meanwhile_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def meanwhile(trained: TrainedPolicy, episodes: int) -> Episodes:
-        monkeypatch.setattr(bundling, "play_greedily", play_greedily)
+    def meanwhile(trained: TrainedPolicy, episodes: int) -> FinalEvaluation:
+        monkeypatch.setattr(bundling, "evaluate", evaluate)
         bundle(drawn_policy("vector"), tmp_path, 4, name="other")
-        return play_greedily(trained, episodes)
+        return evaluate(trained, episodes)
 
-    monkeypatch.setattr(bundling, "play_greedily", meanwhile)
+    monkeypatch.setattr(bundling, "evaluate", meanwhile)
     bundle(drawn_policy("choice"), tmp_path, 4, name="own")
     assert [entry.name for entry in read_bundled(tmp_path)] == ["other", "own"]
 
@@ -279,18 +280,6 @@ def test_two_exports_into_one_folder_take_turns(tmp_path: Path) -> None:
     other.join()
     assert order == ["first", "second"]
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_normalised_score_is_0_for_the_random_and_1_for_the_best_hand_written_policy(monkeypatch) -> None:
-    trained = open_policy(Path("navigation")).single_seed()
-    played = [SimpleNamespace(returns=torch.full((1, 2), value)) for value in (-200.0, -120.0, -100.0)]
-    found = dict(zip(("random", "heuristic", "cover"), played, strict=True))
-    monkeypatch.setattr(bundling, "play_references", lambda *_: found)
-    score = {"sem": 1.0, "ci95": (0.0, 1.0), "episodes": 2}
-    scores = [normalised_of(trained, Score(mean=mean, **score)) for mean in (-200.0, -150.0, -100.0)]
-    assert scores == [0.0, 0.5, 1.0]
-    monkeypatch.setattr(bundling, "play_references", lambda *_: {"random": found["random"]})
-    assert normalised_of(trained, Score(mean=-150.0, **score)) is None, "nothing by hand, no scale"
 
 
 def test_the_scores_on_file_are_normalised() -> None:

@@ -63,9 +63,9 @@ def test_a_final_evaluation_states_what_was_played_and_is_json(tmp_path):
 def test_the_measures_of_the_task_are_those_of_the_greedy_policy(tmp_path):
     trained = untrained(tmp_path, task__horizon=8)
     result = evaluate(trained, 3)
-    greedy = play_batches(trained, PolicyController(trained.policy), "greedy", 3).metrics
+    greedy = play_batches(trained.config, PolicyController(trained.policy), "greedy", 3).metrics
     noise = generators(trained.config.seeds, "judgement", "noise")
-    drawn = play_batches(trained, PolicyController(trained.policy, noise), "stochastic", 3).metrics
+    drawn = play_batches(trained.config, PolicyController(trained.policy, noise), "stochastic", 3).metrics
     assert result.metrics == pytest.approx({name: value.mean().item() for name, value in greedy.items()})
     for name, value in greedy.items():
         assert result.metrics_per_seed[name] == pytest.approx(value.mean(1).tolist())
@@ -108,8 +108,8 @@ def test_anchors_lie_where_the_card_says(tmp_path):
 def test_a_seed_is_evaluated_alone_as_among_others(tmp_path):
     both, first, second = (evaluate(untrained(tmp_path, seeds), 2) for seeds in ((3, 7), (3,), (7,)))
     for mode in ("greedy", "stochastic"):
-        alone = first.returns(mode).per_seed + second.returns(mode).per_seed
-        assert both.returns(mode).per_seed == pytest.approx(alone, rel=1e-5)
+        alone = getattr(first, mode).per_seed + getattr(second, mode).per_seed
+        assert getattr(both, mode).per_seed == pytest.approx(alone, rel=1e-5)
     for name in ("random", "heuristic"):
         mean = (first.anchors[name] + second.anchors[name]) / 2
         assert both.anchors[name] == pytest.approx(mean, rel=1e-5)

@@ -20,7 +20,6 @@ from esp_cli.policies.statistics import (
     interquartile_mean,
     mean_and_sem,
     median_steps,
-    normalise,
     normalised,
     probability_of_improvement,
     spread_over_episodes,
@@ -91,8 +90,6 @@ def test_the_aggregate_bootstrap_is_stratified():
 def test_aggregate_of_one_task_is_the_statistic_of_that_task():
     assert aggregate({"a": TEN}, "mean").ci95 == pytest.approx(bootstrap_interval(TEN))
     assert aggregate({"a": TEN}) == interquartile_mean(TEN)
-    with pytest.raises(ValueError, match="no task"):
-        aggregate({})
 
 
 def test_difference_by_hand():
@@ -112,8 +109,6 @@ def test_pairing_removes_what_the_seeds_share():
     assert unpaired.value == pytest.approx(1.4)
     assert 1.0 <= paired.ci95[0] < paired.ci95[1] <= 2.0
     assert unpaired.ci95[0] < -10
-    with pytest.raises(ValueError, match="not 5 and 4 of them"):
-        difference(x, y[:4], paired=True)
 
 
 def test_probability_of_improvement_by_hand():
@@ -169,31 +164,23 @@ def test_area_under_curve_by_hand():
     # trapezoids 100 * 1 + 300 * 2 over 400; a constant has its height
     values = np.array([[0.0, 7.0], [2.0, 7.0], [2.0, 7.0]])
     assert area_under_curve([0, 100, 400], values).tolist() == [1.75, 7.0]
-    with pytest.raises(ValueError, match="two evaluations or more"):
-        area_under_curve([0], [[1.0]])
 
 
-@pytest.mark.parametrize(
-    ("steps", "values", "text"),
-    [
-        ([1, 2], [1.0, 2.0], r"steps \[K\] and values \[K, S\]"),
-        ([1, 2], [[1.0]], r"not \[2\] and \[1, 1\]"),
-        ([2, 1], [[1.0], [2.0]], "ascend"),
-        ([1, 1], [[1.0], [2.0]], "ascend"),
-        ([], np.zeros((0, 2)), r"not \[0\]"),
-    ],
-)
-def test_curves_that_are_none_are_one_sentence(steps, values, text):
-    for function in (lambda: steps_to_threshold(steps, values, 0.0), lambda: area_under_curve(steps, values)):
-        with pytest.raises(ValueError, match=text):
-            function()
+@pytest.mark.parametrize("steps", [[2, 1], [1, 1]])
+def test_steps_that_do_not_ascend_are_one_sentence(steps):
+    with pytest.raises(ValueError, match="ascend"):
+        steps_to_threshold(steps, [[1.0], [2.0]], 0.0)
 
 
-def test_normalise_sets_random_to_zero_and_heuristic_to_one():
-    assert normalise([-220.0, -110.0, -165.0, -55.0], -220.0, -110.0).tolist() == [0.0, 1.0, 0.5, 1.5]
-    for heuristic in (-220.0, math.nan):
-        with pytest.raises(ValueError, match="the heuristic has to be better"):
-            normalise([1.0], -220.0, heuristic)
+def test_normalised_sets_random_to_zero_and_the_best_heuristic_to_one():
+    anchors = {"random": -220.0, "heuristic": -110.0, "cover": -150.0}
+    assert normalised([-220.0, -110.0, -165.0, -55.0], anchors).tolist() == [0.0, 1.0, 0.5, 1.5]
+    for scaleless in (
+        {"random": -220.0},
+        {"random": -220.0, "heuristic": -220.0},
+        {"random": 0.0, "heuristic": math.nan},
+    ):
+        assert normalised([1.0], scaleless) is None
 
 
 def test_curve_band_is_the_interval_at_each_step():
@@ -212,8 +199,6 @@ def test_a_stopped_seed_leaves_a_gap_and_one_seed_is_the_curve(recwarn):
     for edge in curve_band([[1.0], [2.0]]):
         assert edge.tolist() == [1.0, 2.0]
     assert not recwarn.list
-    with pytest.raises(ValueError, match=r"\[K, S\], not of shape \[3\]"):
-        curve_band([1.0, 2.0, 3.0])
 
 
 def test_the_spread_over_episodes_is_that_of_their_mean() -> None:
