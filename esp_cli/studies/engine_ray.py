@@ -14,7 +14,7 @@ import socket
 import time
 from collections.abc import Mapping, Sequence
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -175,14 +175,7 @@ def versions() -> Mapping[str, str]:
         for file in sorted(root.rglob("*.py")):
             digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes() + b"\0")
     found = {"esp": f"{__version__} ({digest.hexdigest()[:10]})", "Python": platform.python_version()}
-    return found | {name: _version(name) for name in _LIBRARIES}
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return "missing"
+    return found | {name: version(name) for name in _LIBRARIES}
 
 
 def refuse_difference(node: str, theirs: Mapping[str, str], ours: Mapping[str, str]) -> None:

@@ -161,7 +161,6 @@ def test_a_name_with_control_characters_leaves_a_picture_that_opens_and_no_escap
 @pytest.mark.parametrize(
     ("draw", "text"),
     [
-        (lambda path: draw([Curve("a", [1], [1.0])], path), r"\[K, S\]"),
         (lambda path: dots({"a": [math.nan]}, path, "t", "x"), "not finite"),
         (lambda path: dots(GROUPS, "/dev/null/a", "t", "x"), "cannot write the figure .*(Not a directory|File exists)"),
     ],
