@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from esp_cli.defaults import SLOWEST
 from esp_cli.drawing.figures import INCHES, PAPER, PAPER_DPI, STEADY, saved, summary
 from esp_cli.drawing.films import GIF_FRAMES_PER_SECOND, Frame, frame, write_gif, write_mp4, write_png
-from esp_cli.drawing.recording import HOLD_SECONDS, Episode, Moment, framed, record
+from esp_cli.drawing.recording import HOLD_SECONDS, Episode, framed, record
 from esp_cli.files.writing import write_file
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training.build import build_environment
@@ -181,13 +181,13 @@ def open_painter(env: Environment, view: View, size: int) -> Iterator[Painter]:
 class Shot:
     """One frame to draw."""
 
-    moments: tuple[Moment, ...]  # what is side by side
+    episodes: tuple[Episode, ...]  # what is side by side, until then
     caption: str  # what stands before the time
     time_s: float  # since the episode began, s
     steps: int  # how many it stays in view
 
     def draw(self, painter: Painter) -> Frame:
-        return frame(painter, self.moments, self.caption, self.time_s)
+        return frame(painter, self.episodes, self.caption, self.time_s)
 
 
 def shots(
@@ -204,8 +204,8 @@ def shots(
         end = max(episode.steps for episode in together)
         shown = sorted({*range(0, end + 1, every), end})
         for step, following in zip(shown, [*shown[1:], end + 1], strict=True):
-            moments = tuple(episode.moment(step, name) for episode, name in zip(together, names, strict=True))
-            chosen.append(Shot(moments, caption, step * period_s, following - step))
+            until = tuple(episode.until(step, name) for episode, name in zip(together, names, strict=True))
+            chosen.append(Shot(until, caption, step * period_s, following - step))
     return chosen
 
 

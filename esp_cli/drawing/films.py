@@ -16,7 +16,7 @@ from imageio.v2 import get_writer
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from esp_cli.drawing.recording import Moment
+from esp_cli.drawing.recording import Episode
 from esp_cli.files.writing import write_file
 from esp_envs.drawing import TopPainter, font, grid_lines
 from esp_envs.scene import DARK, Painter, Scene
@@ -53,24 +53,24 @@ def marks(scene: Scene) -> tuple[Mark, ...]:
     return tuple(by_label.values())
 
 
-def frame(painter: Painter, moments: Sequence[Moment], left: str, time_s: float) -> Frame:
+def frame(painter: Painter, episodes: Sequence[Episode], left: str, time_s: float) -> Frame:
     """Draw one world, or two side by side, with axes, a legend, and a caption that ends with the time."""
-    pictures = [painter.draw(moment.scene, moment.scenes[:-1]) for moment in moments]
+    scene = episodes[0].scenes[-1]
+    pictures = [painter.draw(episode.scenes[-1], episode.scenes[:-1]) for episode in episodes]
     width = pictures[0].shape[1]
     if width < LEAST_WIDTH:
         return beside(pictures, 0)
     size, flat = max(_LEAST_FONT, round(width * _FONT_SHARE)), isinstance(painter, TopPainter)
-    flat = flat and moments[0].scene.picture is None
+    flat = flat and scene.picture is None
     if flat:
-        pictures = [_with_axes(picture, moment.scene, size) for picture, moment in zip(pictures, moments, strict=True)]
+        pictures = [_with_axes(picture, own.scenes[-1], size) for picture, own in zip(pictures, episodes, strict=True)]
     time, end = f"{time_s:.1f} s", ""
-    if len(moments) > 1:
-        named = [_bar(p.shape[1], size, str(m.name), _total(m), m.end) for p, m in zip(pictures, moments, strict=True)]
+    if len(episodes) > 1:
+        named = [_bar(p.shape[1], size, str(m.name), _total(m), m.end) for p, m in zip(pictures, episodes, strict=True)]
         pictures = [np.concatenate(parts) for parts in zip(named, pictures, strict=True)]
     else:
-        time, end = f"{time}, {_total(moments[0])}", moments[0].end
+        time, end = f"{time}, {_total(episodes[0])}", episodes[0].end
     body = beside(pictures, _GAP)
-    scene = moments[0].scene
     held = dict.fromkeys(Mark(body.held, "ring", (DARK,)) for body in scene.bodies if body.reach is not None)
     legend = _legend((*marks(scene), *(held if flat else ())), body.shape[1], size, _scale(scene, flat))
     return np.concatenate([_bar(body.shape[1], size, left, time, end), body, legend])
@@ -116,8 +116,8 @@ def write_png(path: Path, picture: Frame) -> None:
     write_file(path, iio.imwrite("<bytes>", picture, extension=".png"))
 
 
-def _total(moment: Moment) -> str:
-    return f"return {moment.total:.1f}"
+def _total(episode: Episode) -> str:
+    return f"return {episode.returns[-1]:.1f}"
 
 
 def _scale(scene: Scene, flat: bool) -> str:

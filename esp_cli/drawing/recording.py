@@ -19,35 +19,22 @@ _MARGIN = 0.02  # share of a window by which bodies may leave it before it grows
 
 
 @dataclass(frozen=True)
-class Moment:
-    """One world at one time: a scene after those that its trails come from."""
-
-    scenes: Sequence[Scene]  # of the episode until now
-    total: float  # return until now
-    name: str | None = None  # of the policy where two are compared, else None
-    end: str = ""  # what a film says where the episode has ended
-
-    @property
-    def scene(self) -> Scene:
-        return self.scenes[-1]
-
-
-@dataclass(frozen=True)
 class Episode:
-    """An episode to draw."""
+    """An episode to draw, or its beginning."""
 
-    scenes: Sequence[Scene]  # its start and every step, up to the one that ends it
+    scenes: Sequence[Scene]  # its start and every step; trails come from those before the last
     returns: Sequence[float]  # mean return of the agents until each scene
-    end: str = "end"  # how it ended
+    end: str = ""  # how it ended, where it has
+    name: str | None = None  # of the policy where two are compared
 
     @property
     def steps(self) -> int:
         return len(self.scenes) - 1
 
-    def moment(self, step: int, name: str | None = None) -> Moment:
+    def until(self, step: int, name: str | None = None) -> Episode:
         """Return the episode until a step, or until its end where that comes first."""
-        step = min(step, self.steps)
-        return Moment(self.scenes[: step + 1], self.returns[step], name, self.end if step == self.steps else "")
+        until = slice(step + 1)
+        return Episode(self.scenes[until], self.returns[until], self.end if step >= self.steps else "", name)
 
 
 def record(policies: Sequence[TrainedPolicy], episodes: int | None = None, greedy: bool = True) -> list[list[Episode]]:

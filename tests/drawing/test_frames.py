@@ -7,7 +7,7 @@ import pytest
 
 from esp_cli.drawing import films as frames
 from esp_cli.drawing.films import Mark, frame, marks
-from esp_cli.drawing.recording import Moment
+from esp_cli.drawing.recording import Episode
 from esp_envs import Body, Scene
 from esp_envs.drawing import TopPainter, draw
 from tests.drawing.scenes import BLUE, GREEN, RED, WINDOW
@@ -36,24 +36,24 @@ def written(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def test_the_caption_says_task_episode_time_and_return(written: list[str]) -> None:
-    frame(TopPainter(240), [Moment([TEAM], -3.14)], "task, episode 1 of 2", 1.25)
+    frame(TopPainter(240), [Episode([TEAM], [-3.14])], "task, episode 1 of 2", 1.25)
     assert "task, episode 1 of 2" in written
     assert "1.2 s, return -3.1" in written
 
 
 def test_the_legend_names_what_has_a_label_and_the_axes_their_unit(written: list[str]) -> None:
-    frame(TopPainter(240), [Moment([TEAM], 0.0)], "", 0.0)
+    frame(TopPainter(240), [Episode([TEAM], [0.0])], "", 0.0)
     assert {"robot", "goal", "axes in m"} <= set(written)
     assert {"-1", "-0.5", "0", "0.5", "1"} <= set(written)
     written.clear()
     frames._legend.cache_clear()
-    frame(TopPainter(240), [Moment([scene(Body((0.0, 0.0), 0.1, RED), unit="")], 0.0)], "", 0.0)
+    frame(TopPainter(240), [Episode([scene(Body((0.0, 0.0), 0.1, RED), unit="")], [0.0])], "", 0.0)
     assert "robot" not in written
     assert not [text for text in written if text.startswith("axes")]
 
 
 def test_the_picture_itself_stays_as_it_is() -> None:
-    shown = frame(TopPainter(240), [Moment([TEAM], 0.0)], "task", 0.0)
+    shown = frame(TopPainter(240), [Episode([TEAM], [0.0])], "task", 0.0)
     picture = draw(TEAM, 240)
     assert shown.shape[0] > 240 + 30
     assert shown.shape[1] > 240
@@ -68,10 +68,10 @@ def test_the_picture_itself_stays_as_it_is() -> None:
 
 def test_two_worlds_stand_side_by_side_with_their_names(written: list[str]) -> None:
     other = scene(Body((-0.5, -0.5), 0.1, BLUE, label="robot"))
-    moments = [Moment([TEAM], 1.0, "plain"), Moment([other], 2.0, "esp")]
-    shown = frame(TopPainter(240), moments, "task", 0.5)
+    episodes = [Episode([TEAM], [1.0], name="plain"), Episode([other], [2.0], name="esp")]
+    shown = frame(TopPainter(240), episodes, "task", 0.5)
     assert {"plain", "esp", "return 1.0", "return 2.0", "0.5 s"} <= set(written)
-    alone = frame(TopPainter(240), moments[:1], "task", 0.5)
+    alone = frame(TopPainter(240), episodes[:1], "task", 0.5)
     assert shown.shape[1] == 2 * alone.shape[1] + 8
 
 
@@ -82,14 +82,14 @@ def test_a_view_in_space_tells_the_size_of_its_floor(written: list[str]) -> None
         def draw(self, scene, trail=()):
             return np.full((180, 240, 3), 100, dtype=np.uint8)
 
-    shown = frame(Space(), [Moment([TEAM], 0.0)], "task", 0.0)
+    shown = frame(Space(), [Episode([TEAM], [0.0])], "task", 0.0)
     assert "floor 2 x 2 m" in written
     assert "0.5" not in written, "perspective has no axes"
     assert shown.shape[1] == 240
 
 
 def test_a_picture_too_narrow_for_text_has_none(written: list[str]) -> None:
-    shown = frame(TopPainter(100), [Moment([TEAM], 0.0)], "task", 0.0)
+    shown = frame(TopPainter(100), [Episode([TEAM], [0.0])], "task", 0.0)
     assert np.array_equal(shown, draw(TEAM, 100))
     assert written == []
 
@@ -120,9 +120,7 @@ def test_numbers_along_an_axis_keep_apart() -> None:
 
 
 def test_the_end_of_an_episode_is_white_on_dark_and_says_how_it_ended(written: list[str]) -> None:
-    going, ended = (
-        frame(TopPainter(240), [Moment([TEAM], 1.0, None, end)], "task", 0.5) for end in ("", "end: captured")
-    )
+    going, ended = (frame(TopPainter(240), [Episode([TEAM], [1.0], end)], "task", 0.5) for end in ("", "end: captured"))
     assert {"0.5 s, return 1.0", "0.5 s, return 1.0, end: captured"} <= set(written)
     assert (going[1, 1] > 250).all()
     assert (ended[1, 1] < 50).all()
@@ -134,7 +132,7 @@ def test_what_is_covered_is_ringed_and_named(written: list[str]) -> None:
     rings = [(draw(one, 240)[120, 140:150] < 60).all(-1).sum() for one in (near, far)]  # to the right of the cross
     assert rings[0] > 0
     assert rings[1] == 0
-    frame(TopPainter(240), [Moment([near], 0.0)], "", 0.0)
+    frame(TopPainter(240), [Episode([near], [0.0])], "", 0.0)
     assert "covered" in written
 
 

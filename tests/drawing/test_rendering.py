@@ -170,9 +170,9 @@ def test_a_window_grows_until_everything_stays_in_it():
 def test_shots_keep_the_first_and_last_scene_and_the_time_of_all():
     scenes = line(6)
     taken = shots([[episode(scenes), episode(scenes[:5])]], 2, 0.1, "task")
-    (moments,) = zip(*(shot.moments for shot in taken), strict=True)
-    assert [moment.scene for moment in moments] == [scenes[k] for k in (0, 2, 4, 5, 0, 2, 4)]
-    assert [moment.total for moment in moments] == [0, 2, 4, 5, 0, 2, 4]
+    (moments,) = zip(*(shot.episodes for shot in taken), strict=True)
+    assert [moment.scenes[-1] for moment in moments] == [scenes[k] for k in (0, 2, 4, 5, 0, 2, 4)]
+    assert [moment.returns[-1] for moment in moments] == [0, 2, 4, 5, 0, 2, 4]
     assert [shot.steps for shot in taken] == [2, 2, 1, 1, 2, 2, 1]
     assert [shot.time_s for shot in taken] == pytest.approx([0, 0.2, 0.4, 0.5, 0, 0.2, 0.4])
     assert [shot.caption for shot in taken] == ["task, episode 1 of 2"] * 4 + ["task, episode 2 of 2"] * 3
@@ -321,7 +321,7 @@ def test_the_end_of_every_episode_stays_in_view(tmp_path):
 def test_the_policy_that_ends_first_waits_for_the_other():
     scenes = line(6)
     taken = shots([[episode(scenes)], [episode(scenes[:3])]], 2, 0.1, "task", ("long", "short"))
-    pairs = [[moment.scene for moment in shot.moments] for shot in taken]
+    pairs = [[moment.scenes[-1] for moment in shot.episodes] for shot in taken]
     assert pairs == [[scenes[k], scenes[min(k, 2)]] for k in (0, 2, 4, 5)]
-    assert [moment.name for moment in taken[0].moments] == ["long", "short"]
-    assert [moment.total for moment in taken[-1].moments] == [5, 2]
+    assert [moment.name for moment in taken[0].episodes] == ["long", "short"]
+    assert [moment.returns[-1] for moment in taken[-1].episodes] == [5, 2]
