@@ -81,10 +81,8 @@ def same_observation(a: Observation, b: Observation, where: tuple[Tensor, ...] =
 
 def nearly(a: Sequence[Tensor], b: Sequence[Tensor], bound: float) -> bool:
     """Return whether tensors agree within `bound`; bit for bit where it is 0."""
-    return len(a) == len(b) and all(
-        bool((((x.float() - y.float()).abs() <= bound) | (x == y) | (x.isnan() & y.isnan())).all())
-        for x, y in zip(a, b, strict=True)
-    )
+    close = (torch.allclose(x.float(), y.float(), 0.0, bound, equal_nan=True) for x, y in zip(a, b, strict=False))
+    return len(a) == len(b) and all(close)
 
 
 def require_method(env: Environment, method: str, otherwise: str) -> None:

@@ -196,10 +196,6 @@ def _ticks(low: float, high: float, spacing: float, scale: float, size: int) -> 
 
 def _milliseconds(seconds: Sequence[float]) -> list[int]:
     """Round to the hundredths that a GIF knows, so that the errors do not add up."""
-    shortest = round(1 / (GIF_FRAMES_PER_SECOND * _GIF_TICK_S))
-    ends = np.cumsum(seconds) / _GIF_TICK_S
-    ticks, shown = [], 0
-    for end in ends:
-        ticks.append(max(shortest, round(end) - shown))
-        shown += ticks[-1]
-    return [round(tick * _GIF_TICK_S * 1000) for tick in ticks]
+    ticks = np.diff(np.rint(np.cumsum(seconds) / _GIF_TICK_S), prepend=0)
+    shortest = 1 / (GIF_FRAMES_PER_SECOND * _GIF_TICK_S)
+    return [round(tick * _GIF_TICK_S * 1000) for tick in np.maximum(ticks, shortest)]
