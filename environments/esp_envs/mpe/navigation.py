@@ -132,14 +132,6 @@ class Navigation(ParticleTask):
         agents, landmarks = settings.num_agents, settings.landmarks
         if landmarks * math.log(agents) > math.log(covering.MAX_SHARINGS):
             self.heuristics = ("nearest",)
-        if self.settings.many:
-            return
-        self._to_landmarks = self.worlds.squared_watched_distance.view(agents, landmarks, -1)
-        # [N, pairs]: which agents take part in which pair
-        pairs = self.worlds.bodies.contacts
-        self._takes_part = torch.zeros(agents, len(pairs), device=self.device)
-        for pair, (a, b) in enumerate(pairs):
-            self._takes_part[a, pair] = self._takes_part[b, pair] = 1.0
 
     def _describe(self) -> TaskSpec:
         settings = self.settings
@@ -220,7 +212,8 @@ class Navigation(ParticleTask):
             collisions = 0.5 * touching.sum(0)
         else:
             bumps = (worlds.squared_contact_distance < (2 * AGENT_RADIUS) ** 2).float()
-            touching, collisions, nearest = bumps, bumps.sum(0), self._to_landmarks.amin(0).sqrt_()
+            touching, collisions = bumps, bumps.sum(0)
+            nearest = worlds.squared_watched_distance.view(agents, landmarks, -1).amin(0).sqrt_()
         distance = paid = nearest.sum(0)
         if self.settings.reward_offset:
             paid = self._squared_to(worlds.entity[agents:]).amin(0).sqrt_().sum(0)
@@ -230,7 +223,7 @@ class Navigation(ParticleTask):
         elif self.settings.many:
             reward = paid * (ratio - 1) - ratio * touching
         else:
-            reward = torch.addmm(paid.expand(agents, -1), self._takes_part, touching, beta=ratio - 1, alpha=-ratio)
+            reward = torch.addmm(paid.expand(agents, -1), worlds.pushes.abs(), touching, beta=ratio - 1, alpha=-ratio)
         return reward, {
             "collisions": collisions,
             "collisions_per_agent": collisions * (2 / agents),

@@ -76,6 +76,7 @@ class ParticleWorlds:
             positions; W' is W padded up (see LANE_MULTIPLE). `velocity`, `position` and `entity` are views of it.
         squared_contact_distance: [contacts, W'] of the pairs in `bodies.contacts`, for the present positions.
         squared_watched_distance: [watched, W'] of the pairs in `bodies.watched`.
+        pushes: [A, contacts] 1 and -1 where an agent is the first or the second of a pair.
 
     All of these stay the same memory for good, so that a task may keep views of them. Code that writes to
     `physics` calls `measure` afterwards.
@@ -96,7 +97,7 @@ class ParticleWorlds:
         first, second = torch.tensor(pairs, dtype=torch.int64).view(-1, 2).unbind(1)
         basis = torch.eye(len(bodies.radius))
         self._differences = (basis[first] - basis[second]).to(device)
-        self._pushes = self._differences[:contacts, :agents].t().contiguous()
+        self.pushes = self._differences[:contacts, :agents].t().contiguous()
         self._offset = torch.zeros(len(pairs), 2, lanes, device=device)
         self._contact_offset = self._offset[:contacts]
         self._square = torch.zeros_like(self._offset)
@@ -149,7 +150,7 @@ class ParticleWorlds:
         """Return the velocity change [A, 2, W'] that contacts cause in one step, from the measured pairs."""
         strength = contact_strength(self.squared_contact_distance, self._touching)
         push = self._contact_offset * strength.unsqueeze(1)
-        return exact_matmul(self._pushes, push.flatten(1)).view_as(self.velocity)
+        return exact_matmul(self.pushes, push.flatten(1)).view_as(self.velocity)
 
 
 def lanes_of(num_worlds: int) -> int:
