@@ -129,7 +129,7 @@ class PredatorPrey(ParticleTask):
         agents, half = predators + 1, self.settings.half_side
         pairs: list[tuple[int, int]] = []
         if not self.settings.many:
-            pairs += [(a, predators) for a in range(predators)]  # touches first
+            pairs += [(a, predators) for a in range(predators)]
             pairs += itertools.combinations(range(predators), 2)
             pairs += itertools.product(range(agents), range(agents, agents + obstacles))
         return Bodies(
@@ -232,15 +232,12 @@ class PredatorPrey(ParticleTask):
 
     def _outcome(self) -> tuple[Tensor, dict[str, Tensor]]:
         predators = self.settings.num_predators
-        if self.settings.many:
-            position = self.worlds.position
-            offset = (position[:predators] - position[predators]).square_()
-            square = offset[:, 0] + offset[:, 1]
-        else:
-            square = self.worlds.squared_contact_distance[:predators]
+        position = self.worlds.position
+        offset = (position[:predators] - position[predators]).square_()
+        square = offset[:, 0] + offset[:, 1]
         touches = paid = _touches(square)
         if self.settings.reward_offset:
-            paid = _touches(self._squared_to(self.worlds.position[predators:])[:predators, 0])
+            paid = _touches(self._squared_to(position[predators:])[:predators, 0])
         metrics = {
             "contact": touches.clamp_max(1.0),
             "touches": touches,
@@ -248,7 +245,7 @@ class PredatorPrey(ParticleTask):
         }
         reward = paid * TOUCH_REWARD
         if self._prey_learns:
-            hunted = -reward - out_of_bounds(self.worlds.position[predators] / self.settings.half_side).sum(0)
+            hunted = -reward - out_of_bounds(position[predators] / self.settings.half_side).sum(0)
             both = torch.cat([reward.expand(predators, -1), hunted.unsqueeze(0)])
             reward = hunted if self.settings.control == "prey" else both
         return reward, metrics
