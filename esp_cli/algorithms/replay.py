@@ -35,11 +35,11 @@ class EpisodeBatch(SeedBatch):
     valid: Tensor
 
     @property
-    def mask(self) -> Tensor | None:
+    def mask(self) -> Tensor:
         return self.valid if self.alive is None else self.valid.unsqueeze(-1) & self.alive[:, :, :-1]
 
     @property
-    def played(self) -> Tensor | None:
+    def played(self) -> Tensor:
         return self.valid
 
     def of_living(self, x: Tensor, after: bool = False) -> Tensor:
@@ -48,12 +48,6 @@ class EpisodeBatch(SeedBatch):
             return x
         alive = self.alive[:, :, 1:] if after else self.alive[:, :, :-1]
         return x.masked_fill(~alive if x.dim() == alive.dim() else ~alive.unsqueeze(-1), 0)
-
-
-class WholeEpisodes(EpisodeBatch):
-    """Episodes of agents and worlds that all last to the horizon, so that every row counts."""
-
-    mask = played = None
 
 
 class EpisodeReplay:
@@ -72,8 +66,7 @@ class EpisodeReplay:
             allowed = room(steps + 1, agents, space.count, dtype=torch.bool) if spec.masks else None
         else:
             action = room(steps, agents, space.width)
-        kind = EpisodeBatch if spec.terminates or spec.agents_end else WholeEpisodes
-        self._store = kind(
+        self._store = EpisodeBatch(
             obs=room(steps + 1, agents, spec.observation.width),
             state=room(steps + 1, spec.state.width),
             action=action,
