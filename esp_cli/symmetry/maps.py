@@ -10,9 +10,7 @@ Shape:
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass
-from math import isfinite
 
 import numpy as np
 import torch
@@ -60,12 +58,11 @@ class Dense:
 
 def _product(rows: Tensor, matrix: Tensor) -> Tensor:
     """Return rows [S, B, width] times matrices, where 0 times inf or NaN is 0, in the type of the rows."""
-    kind = rows.device.type
-    with torch.autocast(kind, enabled=False) if torch.is_autocast_enabled(kind) else nullcontext():
+    with torch.autocast(rows.device.type, enabled=False):
         matrix = matrix.to(rows.dtype)
         if rows.is_cpu and not torch.compiler.is_compiling():  # a GPU would be waited for
             product = torch.bmm(rows, matrix)
-            if isfinite(product.sum().item()):
+            if product.detach().sum().isfinite():
                 return product
         product = torch.bmm(rows.where(rows.isfinite(), 0.0), matrix)
         high, low = (~(rows < torch.inf)).to(matrix), (~(rows > -torch.inf)).to(matrix)  # NaN, as inf - inf, is both
