@@ -2,8 +2,9 @@
 
 `PRESETS` holds settings by algorithm, preset and section. `TUNED` holds what the preset `default` changes on a task:
 the settings that measured best there; `PAPER` is the same for the preset `paper`. `FAST` holds what the preset `fast`
-changes in `default` on a task: fewer seconds to the same return. A setting that no table names keeps the default of its
-config class.
+changes in `default` on a task: fewer seconds to the same return. `SETS` holds the settings of tasks on which a network
+over sets is best; both presets have them there, unless another network is chosen. A setting that no table names keeps
+the default of its config class.
 """
 
 from __future__ import annotations
@@ -134,18 +135,38 @@ _FEWER_PASSES: dict[str, object] = {"num_envs": 128, "num_epochs": 5, "num_minib
 _ON_PARTICLES: Sections = {"mappo": {**_FEWER_PASSES, "gamma": 0.95, "gae_lambda": 0.9}}
 FAST: dict[str, dict[str, Sections]] = {"mappo": {"navigation": _ON_PARTICLES, "predator-prey": _ON_PARTICLES}}
 
+# A network over sets learns each landmark and each agent once, not for every order of them.
+SETS: dict[str, dict[str, Sections]] = {
+    "mappo": {
+        "navigation": {"mappo": {**_FEWER_PASSES, "gamma": 0.95, "gae_lambda": 0.9, "critic_input": "state"}}
+        | {"network": {"name": "set"}}
+    },
+    "maddpg": {"navigation": {"network": {"name": "set"}}},
+    "qmix": {"navigation": {"network": {"name": "set"}}},
+}
+
 # what a task changes in the preset `paper`, whose recurrent MAPPO needs whole episodes
 PAPER: dict[str, dict[str, Sections]] = {"mappo": {"formation": {"mappo": {"num_steps": 300}}}}
 
 
-def preset_layers(task: str, algorithm: str, preset: str) -> list[Sections]:
-    """Return the settings of a preset on a task, layer by layer; a later one has the last word."""
+def preset_layers(task: str, algorithm: str, preset: str, network: object = None) -> list[Sections]:
+    """Return the settings of a preset on a task, layer by layer; a later one has the last word.
+
+    Args:
+        task: registered name.
+        algorithm: registered name.
+        preset: "default", or another that the algorithm has.
+        network: that the user chose, None for the preset's own.
+    """
     presets, fast = PRESETS.get(algorithm, {"default": {}}), FAST.get(algorithm, {})
+    sets = SETS.get(algorithm, {}).get(task, {})
+    if preset == "paper" or network not in (None, sets.get("network", {}).get("name")):
+        sets = {}
     if preset == "fast" and fast:
         if task not in fast:
             raise UserError(f"{algorithm} has no preset 'fast' for {task}; it has one for {', '.join(fast)}")
-        return [presets["default"], TUNED.get(algorithm, {}).get(task, {}), fast[task]]
+        return [presets["default"], TUNED.get(algorithm, {}).get(task, {}), fast[task], sets]
     if preset not in presets:
         raise UserError(f"{algorithm} has no preset '{preset}'; it has {', '.join([*presets, *['fast'][: len(fast)]])}")
     of_task = {"default": TUNED, "paper": PAPER}.get(preset, {})
-    return [presets[preset], of_task.get(algorithm, {}).get(task, {})]
+    return [presets[preset], of_task.get(algorithm, {}).get(task, {}), sets]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
-from esp_cli.algorithms.presets import ALGORITHMS
+from esp_cli.algorithms.presets import ALGORITHMS, SETS
 from esp_cli.checking.measured import planned
 from esp_cli.defaults import EPISODES, STUDY_SEEDS
 from esp_cli.files.formatting import file_name, format_exactly
@@ -91,7 +91,7 @@ def _pairs(
         stem = f"{file_name(team.label)}-{format_exactly(steps)}-{file_name(algorithm)}"
         for prior in variants:
             settings = {**team.settings, **kind.variants[prior]}
-            config = _config(task, algorithm, steps, request, settings, kind.common)
+            config = _config(kind, task, algorithm, steps, request, settings)
             yield Cell(
                 name=f"{stem}-{'plain' if prior == 'none' else prior}",
                 panel=f"{team.label}, {format_exactly(steps)}",
@@ -119,7 +119,7 @@ def _variants(
                 continue
             choice = {name: request.group if v == GROUP else v for name, v in kind.variants[variant].items()}
             choice |= strength.settings
-            config = _config(task, algorithm, steps, request, choice, kind.common)
+            config = _config(kind, task, algorithm, steps, request, choice)
             fields = {"task": task, "steps": steps, "algorithm": algorithm, "value": variant.removeprefix("c = ")}
             place = tuple(part.format(**fields) for part in kind.place)
             yield Cell(
@@ -150,8 +150,10 @@ def _steps(kind: StudyKind, task: str, request: Request) -> tuple[int, ...]:
     return tuple(dict.fromkeys(row_of.get(steps, steps) for name, steps in request.steps if name is None))
 
 
-def _config(task: str, algorithm: str, steps: int, request: Request, choice: Settings, common: Settings) -> RunConfig:
-    settings = dict(common)
+def _config(kind: StudyKind, task: str, algorithm: str, steps: int, request: Request, choice: Settings) -> RunConfig:
+    settings = dict(kind.common)
+    if kind.papers_network and request.preset != "paper" and task in SETS.get(algorithm, {}):
+        settings["network.name"] = "mlp"
     for name, value in request.overrides.items():
         if _concerns(name, task, algorithm):
             settings[task_setting(name, task)] = value

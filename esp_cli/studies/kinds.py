@@ -52,6 +52,7 @@ class StudyKind:
     tasks: tuple[str, ...] = ("navigation",)  # unless the user names others
     algorithms: tuple[str, ...] = ("maddpg",)  # unless the user names others
     steps: tuple[int, ...] = ()  # per seed, unless the user names others; empty for the rows of the paper's table
+    papers_network: bool = True  # train the paper's perceptron also where the preset has a network over sets
     all_rows: bool = False  # take every row of the paper's table, not only the first
     only: str | None = None  # the one task that the study is about
     teams: tuple[Team, ...] = ()  # rows beside the task itself
@@ -133,7 +134,11 @@ KINDS: Mapping[str, StudyKind] = {
         },
     ),
     "ablate-prior": StudyKind(
-        "Each learner with the prior and without it", rows="panels", variants=PLAIN_AND_ESP, algorithms=("mappo",)
+        "Each learner with the prior and without it",
+        rows="panels",
+        variants=PLAIN_AND_ESP,
+        algorithms=("mappo",),
+        papers_network=False,
     ),
     "ablate-breaking": StudyKind(
         "Methods for imperfect symmetry over the strength of breaking",

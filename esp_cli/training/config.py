@@ -97,13 +97,18 @@ class RunConfig(Strict):
     def command(self) -> str:
         """Return the `esp train` command line that resolves to this configuration, without what is the default."""
         # so that no world is made with other settings than the user's: what another task declares is said
-        declared = None if TASKS.ships(self.task) else {"prior.transforms": PriorConfig().transforms}
-        plain = resolve_config(self.task, self.algorithm, self.preset, self.steps, self.seeds, self.device, declared)
+        declared = {} if TASKS.ships(self.task) else {"prior.transforms": PriorConfig().transforms}
+        presets = _preset_sections(self.task, self.algorithm, self.preset, None)["network"].get("name", "mlp")
+        named = {} if self.network.name == presets else {"network.name": self.network.name}
+        plain = resolve_config(
+            self.task, self.algorithm, self.preset, self.steps, self.seeds, self.device, declared | named
+        )
         known, own = plain.model_dump(mode="json"), self.model_dump(mode="json")
         words = ["esp", "train", "--task", self.task, "--algo", self.algorithm]
         words += ["--preset", self.preset] if self.preset != "default" else []
         words += [*seed_words(self.seeds), "--steps", str(self.steps)]
         words += ["--device", self.device] if self.device != "cpu" else []
+        words += ["--network", self.network.name] if named else []
         words += ["--init-from", self.init_from.source] if self.init_from else []
         for section, key in ({self.algorithm: "algorithm_settings"} | SECTIONS).items():
             for name, value in own[key].items():
@@ -147,7 +152,7 @@ def resolve_config(
 
     An unknown name or a value out of range is a UserError.
     """
-    sections = _preset_sections(task, algorithm, preset)
+    sections = _preset_sections(task, algorithm, preset, (overrides or {}).get("network.name"))
     _override(sections, overrides or {}, task, algorithm)
     task_settings = resolve_task_settings(task, sections["task"])
     prior = validated(PriorConfig, sections["prior"], "prior")
@@ -189,10 +194,15 @@ def _override(
         sections[section][key] = read = _read(value)
         if isinstance(read, float) and not math.isfinite(read):
             raise UserError(f"bad value {read} for '{dotted}': it has to be a finite number")
-    known = network_class(sections["network"].get("name", "mlp")).model_fields
+    network = sections["network"].get("name", "mlp")
+    known = network_class(network).model_fields
     for name in set(sections["network"]) - set(known):
         if f"network.{name}" not in overrides:
             del sections["network"][name]
+        elif "network.name" not in overrides and name in MlpConfig.model_fields:
+            raise UserError(
+                f"the network '{network}' that the preset has for {task} has no '{name}'; add --network mlp"
+            )
     if sections["prior"].get("kind") == "auto" and "prior.transforms" not in overrides:
         sections["prior"].pop("transforms", None)
 
@@ -211,11 +221,11 @@ def _no_section(dotted: str, task: str, algorithm: str) -> str:
     return f"cannot set '{shortened(dotted)}': a setting is SECTION.NAME with a section of {', '.join(models)}{hint}"
 
 
-def _preset_sections(task: str, algorithm: str, preset: str) -> dict[str, dict[str, object]]:
+def _preset_sections(task: str, algorithm: str, preset: str, network: object) -> dict[str, dict[str, object]]:
     asked, known = ALGORITHMS[algorithm].task_settings, task_class(task).Settings.model_fields
     sections: dict[str, dict[str, object]] = {"task": {name: asked[name] for name in asked if name in known}}
     sections |= {name: {} for name in (algorithm, "network", "prior", "evaluation")}
-    for layer in preset_layers(task, algorithm, preset):
+    for layer in preset_layers(task, algorithm, preset, network):
         for section, values in layer.items():
             sections[section].update(values)
     return sections

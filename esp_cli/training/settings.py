@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ValidationError
 
-from esp_cli.algorithms.presets import ALGORITHMS, FAST, PAPER, PRESETS, TUNED, Sections
+from esp_cli.algorithms.presets import ALGORITHMS, FAST, PAPER, PRESETS, SETS, TUNED, Sections
 from esp_cli.defaults import __version__
 from esp_cli.files.documents import flat, one_sentence, read_table, validate
 from esp_cli.files.formatting import did_you_mean, shortened
@@ -115,7 +115,7 @@ def _settings(section: str, model: type[BaseModel]) -> tuple[Setting, ...]:
             presets=_changes(section, name, PRESETS)
             | _changes(section, name, FAST, "fast on ")
             | _changes(section, name, PAPER, "paper on "),
-            tasks=_changes(section, name, TUNED),
+            tasks=_changes(section, name, TUNED) | _changes(section, name, SETS, "sets on "),
         )
         for name, field in model.model_fields.items()
         if (section, name) != ("network", "name")

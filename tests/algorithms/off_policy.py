@@ -10,8 +10,14 @@ from esp_cli.training.config import resolve_config
 SMALL = {"num_envs": 2, "rounds": 2, "batch_episodes": 3, "replay_episodes": 7, "warmup_episodes": 2}
 
 
+def on_perceptron(task):
+    """Settings that replace the network over sets, the default of navigation."""
+    return {"network.name": "mlp"} if task == "navigation" else {}
+
+
 def learner(algorithm, task="navigation", seeds=(0, 1), **overrides):
     settings = {f"{algorithm}.{name}": value for name, value in SMALL.items()} | {"network.hidden": [16, 16]}
+    settings |= on_perceptron(task)
     settings |= {name.replace("__", ".").replace("algo.", f"{algorithm}."): value for name, value in overrides.items()}
     return build_learner(resolve_config(task, algorithm, steps=10_000, seeds=seeds, overrides=settings))
 
@@ -20,6 +26,7 @@ def small_learner(task, algorithm, hidden=(8, 8), **overrides):
     """A learner of a task of a few steps; settings as "network__name", or as they are written."""
     small = {"num_envs": 4, "num_steps": 6} if algorithm == "mappo" else SMALL
     settings = {f"{algorithm}.{name}": value for name, value in small.items()} | {"network.hidden": list(hidden)}
+    settings |= on_perceptron(task)
     settings |= {name.replace("__", "."): value for name, value in overrides.items()}
     return build_learner(resolve_config(task, algorithm, steps=1000, seeds=(0, 1), overrides=settings))
 

@@ -12,12 +12,13 @@ from esp_cli.networks.contract import WithVJP
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
 from esp_envs.base import Observation
+from tests.algorithms.off_policy import on_perceptron
 
 SMALL = {"mappo.num_envs": 4, "mappo.num_epochs": 2, "mappo.num_minibatches": 2, "network.hidden": [16, 16]}
 
 
 def learner(task="navigation", seeds=(0, 1), **overrides):
-    settings = SMALL | {name.replace("__", "."): value for name, value in overrides.items()}
+    settings = SMALL | on_perceptron(task) | {name.replace("__", "."): value for name, value in overrides.items()}
     return build_learner(resolve_config(task, steps=10_000, seeds=seeds, overrides=settings))
 
 

@@ -20,6 +20,7 @@ from esp_cli.networks import perceptron
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
 from esp_envs.mpe import particles
+from tests.algorithms.off_policy import on_perceptron
 
 ALGORITHMS = ("mappo", "maddpg", "qmix")
 TASKS = ("navigation", "predator-prey")
@@ -95,7 +96,7 @@ def meta(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def learner(task: str, algorithm: str, device: str, **others: object) -> Learner:
-    settings: dict[str, object] = {"network.hidden": [16, 16], f"{algorithm}.num_envs": 4}
+    settings: dict[str, object] = {"network.hidden": [16, 16], f"{algorithm}.num_envs": 4, **on_perceptron(task)}
     if algorithm == "mappo":
         settings |= {"mappo.num_epochs": 2}
     else:

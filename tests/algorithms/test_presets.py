@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import pytest
 
-from esp_cli.algorithms.presets import FAST, PRESETS, preset_layers
+from esp_cli.algorithms.presets import FAST, PRESETS, SETS, preset_layers
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
 
 
 @pytest.mark.parametrize(("algorithm", "task"), [(algorithm, task) for algorithm in FAST for task in FAST[algorithm]])
 def test_fast_is_the_default_of_the_task_but_for_what_its_table_states(algorithm: str, task: str) -> None:
+    perceptron = {"network.name": "mlp"}
     default, fast = (
-        resolve_config(task, algorithm, preset).model_dump(mode="json", exclude={"preset"})
+        resolve_config(task, algorithm, preset, overrides=perceptron).model_dump(mode="json", exclude={"preset"})
         for preset in ("default", "fast")
     )
     for section, values in FAST[algorithm][task].items():
@@ -45,7 +46,19 @@ def test_a_learner_without_fast_settings_is_told_what_it_has(monkeypatch: pytest
     monkeypatch.setitem(FAST, "qmix", {})
     with pytest.raises(ValueError, match=r"^qmix has no preset 'fast'; it has default, paper$"):
         preset_layers("navigation", "qmix", "fast")
-    assert preset_layers("navigation", "qmix", "paper") == [PRESETS["qmix"]["paper"], {}]
+    assert preset_layers("navigation", "qmix", "paper") == [PRESETS["qmix"]["paper"], {}, {}]
+
+
+@pytest.mark.parametrize("algorithm", SETS)
+def test_a_network_over_sets_is_the_default_where_it_is_best_unless_another_is_chosen(algorithm: str) -> None:
+    for preset in ("default", *(["fast"] if algorithm in FAST else [])):
+        assert resolve_config("navigation", algorithm, preset).network.name == "set"
+    stated = SETS[algorithm]["navigation"].get(algorithm, {})
+    sets = resolve_config("navigation", algorithm, overrides={"network.name": "set"}).algorithm_settings
+    assert {name: sets[name] for name in stated} == stated
+    perceptron = resolve_config("navigation", algorithm, overrides={"network.name": "mlp"}).algorithm_settings
+    assert all(perceptron[name] != value for name, value in stated.items())
+    assert resolve_config("navigation", algorithm, "paper").network.name == "gru"
 
 
 @pytest.mark.parametrize("task", ["navigation", "predator-prey", "formation"])

@@ -8,10 +8,11 @@ import torch
 from esp_cli.algorithms.normalisation import ValueNormaliser, with_variances
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
+from tests.algorithms.off_policy import on_perceptron
 
 
 def learner(algorithm: str = "mappo", task: str = "navigation"):
-    overrides = {f"{algorithm}.num_envs": 8, "network.hidden": [16, 16], "prior.kind": "none"}
+    overrides = {f"{algorithm}.num_envs": 8, "network.hidden": [16, 16], "prior.kind": "none"} | on_perceptron(task)
     return build_learner(resolve_config(task, algorithm, steps=10_000, seeds=(0, 1), overrides=overrides))
 
 

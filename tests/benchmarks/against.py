@@ -83,24 +83,25 @@ Case = Training | Worlds
 
 
 def _cases() -> Iterator[tuple[str, Case]]:
+    perceptron = "--network mlp"  # the default of navigation before there were networks over sets
     peers = (
-        "--prior none --set mappo.num_envs=128 --set mappo.num_minibatches=1 --set mappo.num_epochs=10"
+        f"{perceptron} --prior none --set mappo.num_envs=128 --set mappo.num_minibatches=1 --set mappo.num_epochs=10"
         " --set network.activation=relu"
     )
     bfloat16 = "--set network.precision=bfloat16"
     mappo = {
         "mappo 128 x 25, 10 x 1, plain": (peers, 3200),
         "mappo 128 x 25, 10 x 1, plain, bfloat16": (f"{peers} {bfloat16}", 3200),
-        "mappo default, plain": ("--prior none", 800),
-        "mappo default, esp": ("", 800),
-        "mappo default, esp, bfloat16": (bfloat16, 800),
+        "mappo default, plain": (f"{perceptron} --prior none", 800),
+        "mappo default, esp": (perceptron, 800),
+        "mappo default, esp, bfloat16": (f"{perceptron} {bfloat16}", 800),
     }
     for name, (options, per_iteration) in mappo.items():
         yield f"{name}, 10 seeds", Training(options, 10, 12 * per_iteration)
         yield f"{name}, 1 seed", Training(options, 1, 25 * per_iteration)
     for name in ("maddpg", "qmix", "qmix gru"):
         algorithm, _, network = name.partition(" ")
-        options = f"--algo {algorithm}" + f" --network {network}" * bool(network)
+        options = f"--algo {algorithm} --network {network or 'mlp'}"
         yield f"{name}, plain, 10 seeds", Training(f"{options} --prior none", 10, 12 * 200)
         yield f"{name}, esp, 10 seeds", Training(options, 10, 12 * 200)
     yield "formation, esp train end to end, 1 seed", Training("--task formation", 1, 48_000, end_to_end=True)

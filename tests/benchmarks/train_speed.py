@@ -40,8 +40,9 @@ PEER_LAYOUT: dict[str, object] = {
     "network.activation": "relu",
 }
 """128 worlds x 25 steps, 10 epochs x 1 minibatch, MLP 64-64: the layout in which MAPPO implementations are compared."""
-PLAIN: dict[str, object] = {"prior.kind": "none"}
-BFLOAT16: dict[str, object] = {"network.precision": "bfloat16"}
+MLP: dict[str, object] = {"network.name": "mlp"}
+PLAIN: dict[str, object] = MLP | {"prior.kind": "none"}
+BFLOAT16: dict[str, object] = MLP | {"network.precision": "bfloat16"}
 GRU: dict[str, object] = {"network.name": "gru"}
 STATE: dict[str, object] = PLAIN | {"mappo.critic_input": "state", "network.compiled": True}
 SET: dict[str, object] = STATE | {"network.name": "set"}
@@ -53,7 +54,7 @@ CASES: dict[str, tuple[str, dict[str, object]]] = {
     "mappo 128 x 25, 10 x 1, plain": ("mappo", PEER_LAYOUT | PLAIN),
     "mappo 128 x 25, 10 x 1, plain, bfloat16": ("mappo", PEER_LAYOUT | PLAIN | BFLOAT16),
     "mappo default, plain": ("mappo", PLAIN),
-    "mappo default, esp": ("mappo", {}),
+    "mappo default, esp": ("mappo", MLP),
     "mappo default, esp, bfloat16": ("mappo", BFLOAT16),
     "mappo compiled, 3 agents": ("mappo", STATE),
     "mappo set, 3 agents": ("mappo", SET),
@@ -67,9 +68,9 @@ CASES: dict[str, tuple[str, dict[str, object]]] = {
         for agents in CROWDS
     },
     "maddpg, plain": ("maddpg", PLAIN),
-    "maddpg, esp": ("maddpg", {}),
+    "maddpg, esp": ("maddpg", MLP),
     "qmix, plain": ("qmix", PLAIN),
-    "qmix, esp": ("qmix", {}),
+    "qmix, esp": ("qmix", MLP),
     "qmix gru, plain": ("qmix", PLAIN | GRU),
     "qmix gru, esp": ("qmix", GRU),
 }

@@ -44,8 +44,9 @@ def refused(*arguments: object) -> str:
 
 
 def train_tiny(out: Path, *options: object, steps: object = 150) -> Path:
-    """Train a tiny run and return its folder."""
-    esp("train", *TINY_OPTIONS, "--steps", steps, "--out", out, *options)
+    """Train a tiny run, of a perceptron unless the options name a preset or another network, and return its folder."""
+    network = () if "--preset" in options else ("--network", "mlp")
+    esp("train", *network, *TINY_OPTIONS, "--steps", steps, "--out", out, *options)
     return out
 
 

@@ -104,9 +104,9 @@ def test_flops_by_hand(seeds: tuple[int, ...]) -> None:
         obs = build_environment(config, 1, "shape").reset().obs
         return flops_per_action(build_learner(config).policy, obs)
 
-    assert flops("navigation", {"network.hidden": [10]}) == 2 * (14 * 10 + 10 * 5)
+    assert flops("navigation", {"network.name": "mlp", "network.hidden": [10]}) == 2 * (14 * 10 + 10 * 5)
     # each of four images is made by a product of 14 x 14 and brought home by one of 5 x 5
-    ensemble = flops("navigation", {"network.hidden": [10], "network.symmetrise": "c4"})
+    ensemble = flops("navigation", {"network.name": "mlp", "network.hidden": [10], "network.symmetrise": "c4"})
     assert ensemble == 4 * 2 * (14 * 10 + 10 * 5 + 14 * 14 + 5 * 5)
     convolutions = 8 * 8 * 49 * 16 + 4 * 4 * 16 * 25 * 32
     assert flops("wildlife", {"network.hidden": [64]}) == 2 * (convolutions + (2 * 32 + 2) * 64 + 64 * 5)

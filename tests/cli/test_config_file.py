@@ -54,7 +54,8 @@ def test_what_was_measured_in_a_task_is_measured_anew_in_a_changed_one(tmp_path:
 
 
 def test_another_network_takes_the_settings_that_it_has(tmp_path: Path) -> None:
-    whole = printed("--set", "network.hidden=[32,32]", "--set", "network.precision=bfloat16", "--steps", "20k")
+    perceptron = ["--network", "mlp", "--set", "network.hidden=[32,32]", "--set", "network.precision=bfloat16"]
+    whole = printed(*perceptron, "--steps", "20k")
     network = printed("--config", written(tmp_path / "c.json", whole), "--network", "equivariant")["network"]
     assert (network["name"], network["hidden"]) == ("equivariant", [32, 32])
     assert "precision" not in network

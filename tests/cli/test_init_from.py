@@ -43,7 +43,7 @@ def test_a_run_starts_from_another_policy(tmp_path: Path, algorithm: str) -> Non
 
 
 def test_a_run_resumes_without_the_policy_that_it_started_from(finished: Path, copied: Path, tmp_path: Path) -> None:
-    options = [*TINY_OPTIONS, *STEPS, "--seed-list", "3,7", "--init-from"]
+    options = ["--network", "mlp", *TINY_OPTIONS, *STEPS, "--seed-list", "3,7", "--init-from"]
     esp("train", *options, finished, "--out", tmp_path / "whole")
     esp("train", *options, copied / "policy.safetensors", "--out", tmp_path / "cut")
     for file in [*(tmp_path / "cut" / "checkpoints").iterdir(), copied / "policy.safetensors"]:
@@ -60,7 +60,7 @@ def test_a_run_resumes_without_the_policy_that_it_started_from(finished: Path, c
 
 
 def test_a_policy_that_does_not_fit_is_one_sentence_and_leaves_no_folder(finished: Path, tmp_path: Path) -> None:
-    out = ["--out", tmp_path / "run", "--init-from"]
+    out = ["--network", "mlp", "--out", tmp_path / "run", "--init-from"]
     wider = refused("train", "--seeds", 2, "--set", "network.hidden=[9]", *out, finished)
     assert "is [1, 8] there but [1, 9] in this run; choose the task settings and the network" in wider
     other = refused("train", "--algo", "qmix", "--set", "network.hidden=[9]", "--seeds", 2, *out, finished)
@@ -129,7 +129,7 @@ def test_without_a_copy_the_policy_has_to_be_the_one_that_the_run_started_from(c
 
 
 def test_a_policy_of_another_algorithm_starts_a_run_where_it_fits(tmp_path: Path) -> None:
-    small = ["--set", "network.hidden=[8]", "--set", "evaluation.episodes=2", "--steps", 100]
+    small = ["--network", "mlp", "--set", "network.hidden=[8]", "--set", "evaluation.episodes=2", "--steps", 100]
     esp("train", "--algo", "maddpg", *small, "--set", "maddpg.num_envs=2", "--out", tmp_path / "first")
     found = printed("--algo", "qmix", *small, "--init-from", tmp_path / "first")
     assert found["init_from"]["source"] == str(tmp_path / "first")

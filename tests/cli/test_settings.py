@@ -44,7 +44,7 @@ def test_bounds_units_presets_and_tasks_are_told() -> None:
     assert (envs.bounds, envs.unit, envs.tasks) == (
         "from 1",
         "worlds",
-        {"formation": 8, "wildlife": 64, "quadruped": 256},
+        {"formation": 8, "wildlife": 64, "quadruped": 256, "sets on navigation": 128},
     )
     assert (arena.bounds, arena.unit) == ("above 0 to 20", "m")
     assert found["mappo.critic_input"].bounds == "state, observations, own"

@@ -107,8 +107,11 @@ def test_a_return_has_its_normalised_score_beside_it(tmp_path: Path) -> None:
         (["--set", "prior.replay=stored"], "prior.replay"),
         (["--set", "mappo.truncation=5", "--set", "mappo.critic_activation=tanh"], "mappo.truncation"),
         (["--network", "gru", "--set", "mappo.truncation=5"], None),
-        (["--set", "network.precision=bfloat16", "--set", "network.layer_norm=true"], "network.precision"),
-        (["--set", "network.precision=bfloat16"], None),
+        (
+            ["--network", "gru", "--set", "network.precision=bfloat16", "--set", "network.layer_norm=true"],
+            "network.precision",
+        ),
+        (["--network", "mlp", "--set", "network.precision=bfloat16"], None),
         (["--set", "prior.trust=measured", "--set", 'prior.weights={"rot90":0.5}', "--transforms", "rot90"], None),
         (["--prior", "auto", "--set", "prior.doubt=4", "--set", "prior.fade=0.2"], None),
     ],
@@ -246,7 +249,7 @@ def test_a_signal_stops_after_the_iteration_and_the_run_goes_on_to_the_same_end(
         pytest.skip("these tests run under nohup, and so does what they start")
     with monkeypatch.context() as patch:
         patch.setattr(console.TrainingProgress, "update", interrupted)
-        stopped = esp("train", *TINY_OPTIONS, *STEPS, "--seed-list", "3,7", "--out", run, code=130)
+        stopped = esp("train", "--network", "mlp", *TINY_OPTIONS, *STEPS, "--seed-list", "3,7", "--out", run, code=130)
     assert signal.getsignal(number) is before
     assert "stopping after this iteration" in stopped.stderr
     assert stopped.stderr.endswith(f"stopped at 50 steps; continue with: esp train --resume {run}\n")
@@ -343,7 +346,7 @@ def test_a_run_of_which_a_seed_stopped_is_summed_up_over_the_others(
         return replace(iterate(self, progress), finite=torch.tensor([False, True]))
 
     monkeypatch.setattr(Mappo, "iterate", broken)
-    told = esp("train", *TINY_OPTIONS, *STEPS, "--seed-list", "3,7", "--out", tmp_path / "run")
+    told = esp("train", "--network", "mlp", *TINY_OPTIONS, *STEPS, "--seed-list", "3,7", "--out", tmp_path / "run")
     assert "seed 3 stopped at step 50" in told.stderr
     value = read_metrics(tmp_path / "run" / "metrics.jsonl")[-1]["eval/return_greedy"]
     assert value[0] is None

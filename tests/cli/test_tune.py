@@ -108,7 +108,7 @@ def test_a_setting_of_the_task_is_refused_by_its_name_and_auto_is_a_prior_as_any
     (tmp_path / "space.json").write_text(json.dumps({"navigation.wind": [0.0, 0.3], "prior.doubt": [4.0, 8.0]}))
     assert "the space varies 'task.wind'" in refused(*command, "--steps", 100)
     assert not (tmp_path / "t").exists()
-    (tmp_path / "space.json").write_text(json.dumps({"mappo.gamma": [0.9, 0.99], "prior.doubt": [4.0, 8.0]}))
+    (tmp_path / "space.json").write_text(json.dumps({"mappo.gamma": [0.9, 0.95], "prior.doubt": [4.0, 8.0]}))
     command += ["--set", "navigation.wind=0.3"]
     once = ["--budget", 1, "--steps", 100, "--trial-seeds", 1, "--seeds", 1, "--episodes", 4, "--jobs", 1]
     esp(*command, *once, "--prior", "auto,none")

@@ -54,6 +54,7 @@ def drawn_policy(
     """Return policies whose weights are large enough to matter: those of a new one give all actions the same chance."""
     task, algorithm, settings = (KINDS | LARGE | REFUSED)[kind]
     overrides = {
+        **({"network.name": "mlp"} if task == "navigation" else {}),
         "network.hidden": list(hidden),
         **settings,
         **({"network.near": near} if near else {}),

@@ -90,7 +90,8 @@ def test_kernels_sort_alike(reads):
 
 
 def test_it_is_not_exported():
-    learner = build_learner(resolve_config("navigation", "mappo", overrides={"network.order": "nearest"}))
+    sorting = {"network.name": "mlp", "network.order": "nearest"}
+    learner = build_learner(resolve_config("navigation", "mappo", overrides=sorting))
     with pytest.raises(UserError, match="order=nearest"):
         program_of(learner.policy)
 
@@ -103,7 +104,8 @@ def test_what_has_no_sets_is_refused():
 @pytest.mark.parametrize("algorithm", ["mappo", "qmix"])
 def test_learners_train_with_it(algorithm):
     small = {"mappo.num_envs": 4, "qmix.num_envs": 4, "qmix.batch_episodes": 4, "qmix.warmup_episodes": 2}
-    overrides = {"network.order": "nearest", **{k: v for k, v in small.items() if k.startswith(algorithm)}}
+    own = {name: value for name, value in small.items() if name.startswith(algorithm)}
+    overrides = {"network.name": "mlp", "network.order": "nearest", **own}
     learner = build_learner(resolve_config("navigation", algorithm, overrides=overrides))
     assert isinstance(learner.policy.actor, NearestFirst)
     before = [p.clone() for p in learner.policy.parameters()]

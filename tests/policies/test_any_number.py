@@ -76,7 +76,15 @@ def test_a_network_with_a_count_says_so(perceptron: Path, tmp_path: Path) -> Non
     sentence = refused("eval", perceptron, "--set", "task.num_agents=5")
     assert sentence.endswith("the weights of its network are made for a number of agents, of set for any")
     assert "there but" in refused(
-        "train", "--set", "task.num_agents=5", "--set", "network.hidden=[8]", "--init-from", perceptron
+        "train",
+        "--network",
+        "mlp",
+        "--set",
+        "task.num_agents=5",
+        "--set",
+        "network.hidden=[8]",
+        "--init-from",
+        perceptron,
     )
 
 

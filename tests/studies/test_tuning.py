@@ -26,7 +26,7 @@ def tuning(**changes) -> Tuning:
         "budget": 4,
         "steps": 900,
         "trial_seeds": (1000, 1001),
-        "overrides": dict(TINY),
+        "overrides": {"network.name": "mlp", **TINY},
         "space": SPACE | {"prior.consistency_coef": Dimension(low=0.1, high=1.0)},
         "command": "esp tune",
     }

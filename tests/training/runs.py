@@ -15,7 +15,8 @@ TINY = {
 
 def tiny_config(steps=300, seeds=(0, 1), task="navigation", **overrides) -> RunConfig:
     """A run of 50 steps an iteration that takes milliseconds."""
-    settings = TINY | {name.replace("__", "."): value for name, value in overrides.items()}
+    settings = TINY | ({"network.name": "mlp"} if task == "navigation" else {})
+    settings |= {name.replace("__", "."): value for name, value in overrides.items()}
     return resolve_config(task, steps=steps, seeds=seeds, overrides=settings)
 
 

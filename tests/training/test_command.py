@@ -16,7 +16,7 @@ from tests.training.runs import tiny_config
 def test_what_the_preset_has_is_left_out():
     study = plan("table1", Request(algorithms=("mappo",), tasks=("navigation",)))
     assert study.cells[0].config.command() == (
-        "esp train --task navigation --algo mappo --seeds 10 --steps 500000 --prior none"
+        "esp train --task navigation --algo mappo --seeds 10 --steps 500000 --network mlp --prior none"
     )
 
 

@@ -20,7 +20,7 @@ from esp_envs.registry import task_class
 
 
 def test_without_a_choice_every_default_is_the_models_own():
-    config = resolve_config("navigation")
+    config = resolve_config("navigation", overrides={"network.name": "mlp"})
     assert config.algorithm_settings == MappoConfig().model_dump()
     decided = MlpConfig(compiled=False)  # the tests know no compiler
     assert (config.network, config.prior, config.evaluation) == (decided, PriorConfig(), EvaluationConfig())
@@ -209,8 +209,12 @@ def test_a_learner_asks_its_task_for_actions_that_it_can_choose_where_the_user_i
         ({"qmix.tau": 1}, "cannot set 'qmix.tau': a setting is SECTION.NAME"),
         ({"prior.force": 1}, "unknown setting 'prior.force'; prior has kind, transforms, copies"),
         (
-            {"network.width": 1},
+            {"network.name": "mlp", "network.width": 1},
             "unknown setting 'network.width'; the network mlp has name, hidden, symmetrise, activation",
+        ),
+        (
+            {"network.precision": "bfloat16"},
+            "the network 'set' that the preset has for navigation has no 'precision'; add --network mlp",
         ),
         (
             {"network.name": "mpn", "network.group": "d4"},
@@ -258,7 +262,7 @@ def test_a_stored_configuration_is_read_back_as_it_was(task, choice):
 
 
 def test_a_stored_configuration_gets_the_settings_that_came_later_and_keeps_its_own() -> None:
-    now = resolve_config("navigation", overrides={"task.num_agents": 4, "mappo.learning_rate": 1e-3})
+    now = resolve_config("navigation", overrides={"network.name": "mlp", "task.num_agents": 4})
     left_out = {"task_settings": {"wind"}, "algorithm_settings": {"gamma"}}
     then = RunConfig.model_validate(now.model_dump(exclude=left_out))
     assert then != now

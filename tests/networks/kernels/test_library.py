@@ -171,7 +171,7 @@ def test_what_a_pass_keeps_goes_with_its_outputs(kind, compiled):
 )
 def test_long_runs_compute_by_kernels_and_say_so(steps, device, choice, decided, monkeypatch):
     monkeypatch.setattr(plain, "has_compiler", lambda: True)
-    config = resolve_config("navigation", steps=steps, device=device, overrides=choice)
+    config = resolve_config("navigation", steps=steps, device=device, overrides={"network.name": "mlp", **choice})
     assert config.network.compiled is decided
     stored = config.model_dump(mode="json")
     assert parse_config(stored, Path("run")).network.compiled is decided
