@@ -8,14 +8,16 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from operator import methodcaller
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import torch
 
 from esp_cli.policies.evaluation import evaluate
 from esp_cli.policies.loading import TrainedPolicy
-from esp_cli.training.build import build_environment
+from esp_cli.training.build import PolicyController, ScriptedController, build_environment
 
 CROWDED = [{"num_agents": n} for n in (3, 8, 16, 32)]
 SPREAD = [{"num_agents": n, "sees": 8, "density": 8.0} for n in (8, 100, 1000)]
@@ -31,6 +33,22 @@ def played(trained: TrainedPolicy, settings: dict[str, object]) -> dict[str, Any
         "greedy": found["greedy"]["per_seed"],
         "metrics": found["metrics_per_seed"],
     }
+
+
+@torch.no_grad()
+def covered_at_the_end(trained: TrainedPolicy, settings: dict[str, object]) -> dict[str, list[float]]:
+    """Return the share of landmarks that is covered in the last step, by seed, of the policy and of `nearest`."""
+    moved, found = trained.transfer(settings), {}
+    scripted = ScriptedController(methodcaller("heuristic"))
+    for name, controller in {"greedy": PolicyController(moved.policy), "nearest": scripted}.items():
+        env = build_environment(moved.config, max(2, 128 // int(settings["num_agents"])), "end")
+        observation = env.reset()
+        controller.begin(env, observation)
+        for _ in range(env.spec.horizon):
+            step = env.step(controller.act(env, observation))
+            observation = step.next
+        found[name] = step.metrics["coverage"].mean(-1).tolist()
+    return found
 
 
 @torch.no_grad()
@@ -57,11 +75,12 @@ def main() -> None:
     torch.set_num_threads(1)
     trained, rows = TrainedPolicy.read(options.run), []
     for settings in (*CROWDED, *SPREAD):
-        row = played(trained, settings)
+        row = played(trained, settings) | {"covered at the end": covered_at_the_end(trained, settings)}
         rows.append(row)
         random, heuristic = row["anchors"]["random"], row["anchors"]["heuristic"]
         scores = [(value - random) / (heuristic - random) for value in row["greedy"]]
-        means = {name: sum(values) / len(values) for name, values in row["metrics"].items()}
+        means = {name: fmean(values) for name, values in row["metrics"].items()}
+        means |= {f"covered at the end, {name}": fmean(values) for name, values in row["covered at the end"].items()}
         print(settings, "normalised", *(f"{score:.2f}" for score in scores), means, flush=True)
     speed = {n: seconds_a_step(trained, {"num_agents": n, "sees": 8, "density": 8.0}) for n in (16, 100, 1000)}
     print("microseconds an agent-step", {n: round(value, 1) for n, value in speed.items()})
