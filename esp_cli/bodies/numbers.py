@@ -1,6 +1,6 @@
 """What the numbers of observations and actions are, for files that are written and functions that are audited.
 
-def numbers(body):  # in a module of yours: --numbers my_robot:numbers
+def numbers(body):  # in a module of yours: --order my_robot:numbers
 joints = ["left_hip", "right_hip"]
 return {
 "policy": layout(body.spin(), body.gravity(), body.positions(joints)),
@@ -10,8 +10,11 @@ return {
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from esp_cli.bodies.body import Body
 from esp_cli.bodies.kinds import PartsKind
+from esp_cli.files.opening import read_regular
 from esp_cli.symmetry.elements import Element, Floats
 from esp_cli.symmetry.plane import PlaneElement
 from esp_cli.symmetry.representation import layout_operator
@@ -19,28 +22,51 @@ from esp_envs.errors import UserError
 from esp_envs.installed import import_function
 from esp_envs.spec import Layout, layout
 
+_MOST_BYTES = 1 << 20
 ACTION = "action"
 """The name of the actions among groups of observations."""
 Numbers = dict[str, Layout]
 """Layouts of the groups of an observation, by name, and of the action under "action"."""
 
 
-def numbers_of(body: Body, name: str | None) -> Numbers:
-    """Return what a function "module:function" says; without one, the numbers of Isaac Lab's velocity tasks.
+def numbers_of(body: Body, order: str | None) -> Numbers:
+    """Return what a function "module:function" says, or the numbers of Isaac Lab's velocity tasks.
+
+    Args:
+        body: of the robot.
+        order: a function, or a file of joint names in the simulator's order, one a line; by default the model's order.
 
     Raises:
-        UserError: there is no such function, or it returns something else.
+        UserError: there is no such function or file, a line names no joint, or the function returns something else.
     """
-    if name is None:
-        joints = [body.positions(), body.velocities(), body.positions(name="actions")]
+    if order is None or ":" not in order or Path(order).exists():
+        names = None if order is None else _lines(Path(order))
+        actions = body.positions(names, name="actions")
+        joints = [body.positions(names), body.velocities(names), actions]
         seen = layout(body.velocity(), body.spin(), body.gravity(), body.command(), *joints)
-        return {"policy": seen, ACTION: layout(body.positions(name="actions"))}
-    told = import_function(name)(body)
+        return {"policy": seen, ACTION: layout(actions)}
+    told = import_function(order)(body)
     if not isinstance(told, dict) or not all(isinstance(part, Layout) for part in told.values()) or ACTION not in told:
         raise UserError(
-            f"{name} returns {type(told).__name__}; return layouts of observations by name, and of 'action'"
+            f"{order} returns {type(told).__name__}; return layouts of observations by name, and of 'action'"
         )
     return told
+
+
+def _lines(path: Path) -> list[str]:
+    """Return the joint names of a file, one a line.
+
+    Raises:
+        UserError: there is none, or it is no short text.
+    """
+    try:
+        content = read_regular(path, _MOST_BYTES)
+        names = "" if content is None else content.decode()
+    except UnicodeDecodeError:
+        names = ""
+    if not names.split():
+        raise UserError(f"{path} is no list of joints; write their names in your simulator's order, one a line")
+    return [line.strip() for line in names.splitlines() if line.strip()]
 
 
 def map_of(numbers: Layout, element: PlaneElement) -> Floats:

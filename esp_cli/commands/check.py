@@ -1,4 +1,4 @@
-"""`esp check`: does a task keep what every task promises, and is it as symmetric as it declares?"""
+"""`esp check`: is a task, a mirror of a robot, or a policy as symmetric as it should be?"""
 
 from __future__ import annotations
 
@@ -23,15 +23,30 @@ if TYPE_CHECKING:
 EPILOG = """Examples:\n
     esp check task rendezvous:Rendezvous\n
     esp check symmetry navigation --set task.actions=continuous\n
-    esp check symmetry rendezvous:Rendezvous --transforms d8*agents --json symmetry.json"""
+    esp check symmetry rendezvous:Rendezvous --transforms d8*agents --json symmetry.json\n
+    esp check mirror my_symmetry:compute_symmetric_states robot.xml --order joints.txt\n
+    esp check policy policy.onnx robot.xml --order my_robot:numbers"""
 
 _SYMMETRY = "actions and layouts can carry the declared symmetry"
 _ROUNDING = 1e-4  # how far a step from a restored state may differ: physics may be finer than the float32 of states
 
 
 def check(
-    what: Annotated[Literal["task", "symmetry"], typer.Argument(help="What to check.", metavar="task|symmetry")],
-    task: Annotated[str, typer.Argument(help="Task: one that `esp tasks` lists, or module:Class.", metavar="TASK")],
+    what: Annotated[
+        Literal["task", "symmetry", "mirror", "policy"],
+        typer.Argument(help="What to check.", metavar="task|symmetry|mirror|policy"),
+    ],
+    task: Annotated[
+        str,
+        typer.Argument(
+            help="A task that `esp tasks` lists, or module:Class; a mirror as module:function; a policy as ONNX, "
+            "TorchScript or module:function.",
+            metavar="NAME",
+        ),
+    ],
+    robot: Annotated[
+        Path | None, typer.Argument(help="Its MJCF or URDF file, of a mirror or a policy.", metavar="ROBOT.xml")
+    ] = None,
     transforms: Annotated[
         str | None, typer.Option("--transforms", help="Elements to try, as d8*agents; by default many.")
     ] = None,
@@ -41,15 +56,28 @@ def check(
     ] = None,
     algo: options.OwnAlgoOption = None,
     network: options.OwnNetworkOption = None,
+    order: options.OrderOption = None,
+    rows: Annotated[
+        Path | None, typer.Option("--rows", help="Observations that a policy meets [M, D].", metavar="FILE.npy")
+    ] = None,
+    root: options.RootOption = None,
     seconds: options.SecondsOption = 50.0,
     json: options.JsonOption = None,
 ) -> None:
-    """Check what every task promises, or a task's declared symmetry.
+    """Check a task, its declared symmetry, a robot's mirror that you wrote, or whether a policy turns with its robot.
 
     Symmetry is tested per element and field: it holds, is broken, or is not covered (no data could have shown a
-    breaking). Exit code 0: all that is promised or declared holds; 1: something is broken; 2:
-    something is not covered.
+    breaking). Of a mirror each number is compared with what the model proves. Exit code 0: all that is promised or
+    declared holds; 1: something is broken; 2: something is not covered.
     """
+    if what in ("mirror", "policy"):
+        if any((settings, transforms, policy, algo, network)):
+            raise UserError("--set, --transforms, --policy, --algo and --network belong to tasks; leave them out")
+        from esp_cli.commands.mirror import check_robot
+
+        raise typer.Exit(check_robot(what, task, robot, root, order, rows, seconds, json))
+    if any((robot, root, order, rows)):
+        raise UserError("a model, --root, --order and --rows belong to 'esp check mirror|policy'; leave them out")
     from esp_cli.training.config import resolve_task_settings
     from esp_envs.registry import make
 

@@ -42,10 +42,10 @@ _GROUPS: dict[str, tuple[str, ...]] = {
 }
 _MOVED: dict[str, dict[str, str]] = {  # options that belong elsewhere in a command than in the others
     "train": {"task": _TRAINED, "algo": _TRAINED, "network": _TRAINED, "physics": _TRAINED, "prior": _PRIOR},
-    "check": {"transforms": "Options"},
+    "check": {"transforms": "Options", **dict.fromkeys(("order", "rows", "root"), "Robots")},
     "discover": {"task": _SEARCHED, "transforms": _SEARCHED, "logs": _SEARCHED},
     "tune": {"prior": _PRIOR},
-    "mirror": {"root": _SEARCHED, "numbers": _SEARCHED, "check": _SEARCHED, "emit": _OUTPUT},
+    "mirror": {"root": _SEARCHED, "emit": _OUTPUT, "order": _OUTPUT},
 }
 _WORDS = {int: "COUNT", float: "NUMBER", Path: "PATH"}
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from esp_cli import console
-from esp_cli.commands.options import ForceOption, JsonOption, SecondsOption
+from esp_cli.commands.options import ForceOption, JsonOption, OrderOption, RootOption, SecondsOption
 from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
@@ -21,41 +21,21 @@ if TYPE_CHECKING:
 EPILOG = """Examples:\n
     esp mirror robot.xml\n
     esp mirror robot.urdf --json mirror.json\n
-    esp mirror robot.xml --numbers my_robot:numbers --emit rsl_rl -o mirror.py\n
-    esp mirror robot.xml --check symmetry:compute_symmetric_states\n
-    esp mirror robot.xml --numbers my_robot:numbers --policy policy.onnx"""
+    esp mirror robot.xml --order joints.txt --emit rsl_rl -o mirror.py\n
+    esp check mirror symmetry:compute_symmetric_states robot.xml"""
 
 _SHOWN = 4  # elements that have a column in the table; the others are in the JSON
 
 
 def mirror(
     model: Annotated[Path, typer.Argument(help="An MJCF or URDF file.", metavar="MODEL")],
-    root: Annotated[
-        Path | None, typer.Option("--root", help="Folder that holds all its files; by default its own.", metavar="DIR")
-    ] = None,
-    numbers: Annotated[
-        str | None,
-        typer.Option(
-            "--numbers", help="Function that says what your numbers are, for --emit and --check.", metavar="MODULE:NAME"
-        ),
-    ] = None,
+    root: RootOption = None,
+    order: OrderOption = None,
     emit: Annotated[
         Literal["rsl_rl", "isaaclab", "mjlab", "skrl", "sb3", "numpy"] | None,
         typer.Option("--emit", help="Write the mirror as a file for this loop.", metavar="HOST"),
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Path of that file.", metavar="FILE")] = None,
-    check: Annotated[
-        str | None, typer.Option("--check", help="Audit a mirror that you wrote.", metavar="MODULE:NAME")
-    ] = None,
-    policy: Annotated[
-        Path | None,
-        typer.Option(
-            "--policy", help="Measure how far a policy is from turning with its body.", metavar="FILE|MODULE:NAME"
-        ),
-    ] = None,
-    rows: Annotated[
-        Path | None, typer.Option("--rows", help="Observations that it meets, for --policy.", metavar="FILE.npy")
-    ] = None,
     seconds: SecondsOption = 50.0,
     force: ForceOption = False,
     json: JsonOption = None,
@@ -63,36 +43,22 @@ def mirror(
     """Find the mirrors and turns of a robot from its model, and prove them in MuJoCo.
 
     The robot faces x: flip-x is its left-right mirror, flip-y front-back. An element holds where accelerations of
-    mirrored states are the mirrored accelerations. Exit code 0: it has a symmetry, and what is checked is right; 1: it
-    has none, or something is wrong.
+    mirrored states are the mirrored accelerations. Exit code 0: it has a symmetry; 1: it has none.
     """
     from esp_cli.bodies import Body
 
     if (emit is None) != (out is None):
         raise UserError("--emit and -o belong together: esp mirror robot.xml --emit rsl_rl -o mirror.py")
-    if numbers is not None and emit is None and check is None and policy is None:
-        raise UserError("--numbers is for --emit, --check and --policy; give one of them, or leave --numbers out")
+    if order is not None and emit is None:
+        raise UserError("--order says what is in the file that --emit writes; add --emit, or leave --order out")
     if out is not None and not force and (taken := [path for path in (out, _proof_of(out)) if path.exists()]):
         raise UserError(f"{taken[0]} exists; choose another path, or add --force")
-    if rows is not None and policy is None:
-        raise UserError("--rows are observations for --policy; name the policy too")
     body = Body.from_mjcf(model, root, seconds=seconds)
     if emit is not None and out is not None:
-        _write(body, model, numbers, emit, out)
-    audited = [] if check is None else _audited(check, body, numbers)
-    measured = [] if policy is None else _measured(str(policy), rows, body, numbers)
-
-    def show() -> None:
-        if check:
-            _print_audit(check, audited)
-        if policy:
-            _print_turning(str(policy), measured)
-        if not check and not policy:
-            _print(body, model)
-
+        _write(body, model, order, emit, out)
     if emit is None or json:
-        console.result(json, {**described(body, model), "check": audited, "policy": measured}, show)
-    if not body.found or any(copy.wrong for copy in audited):
+        console.result(json, described(body, model), lambda: _print(body, model))
+    if not body.found:
         raise typer.Exit(1)
 
 
@@ -116,38 +82,60 @@ def described(body: Body, model: Path) -> dict[str, Any]:
     return {"model": str(model), "group": body.group, "elements": elements, "refused": body.refused}
 
 
-def _write(body: Body, model: Path, numbers: str | None, host: str, out: Path) -> None:
+def _write(body: Body, model: Path, order: str | None, host: str, out: Path) -> None:
     from esp_cli.bodies.emitting import HOSTS, emitted, proof
     from esp_cli.bodies.numbers import numbers_of
     from esp_cli.files.writing import write_file
 
-    layouts = numbers_of(body, numbers)
+    layouts = numbers_of(body, order)
     write_file(out, emitted(body, layouts, model.name).encode())
     write_file(_proof_of(out), proof(body, layouts, out.name).encode())
     groups = "; ".join(f"{name}: {layout.summary}" for name, layout in layouts.items())
     console.say(f"{out} has {HOSTS[host]} for {', '.join(body.found)}; {groups}")
     console.note(f"{_proof_of(out)} proves it, with numpy alone")
-    if numbers is None:
-        console.note("the numbers are those of Isaac Lab's velocity tasks; --numbers names a function with yours")
+    if order is None:
+        console.note(
+            "the numbers are those of Isaac Lab's velocity tasks, joints in the model's order; --order says yours"
+        )
 
 
 def _proof_of(out: Path) -> Path:
     return out.with_name(f"test_{out.stem}.py")
 
 
-def _audited(check: str, body: Body, numbers: str | None) -> list[Copy]:
+def check_robot(
+    what: str,
+    name: str,
+    model: Path | None,
+    root: Path | None,
+    order: str | None,
+    rows: Path | None,
+    seconds: float,
+    json: str | None,
+) -> int:
+    """Check a mirror that somebody wrote, or how far a policy is from turning with its body."""
+    from esp_cli.bodies import Body
     from esp_cli.bodies.auditing import audit
     from esp_cli.bodies.numbers import numbers_of
+    from esp_cli.bodies.turning import policy_of, rows_of, turning
     from esp_envs.installed import import_function
 
-    return audit(import_function(check), body, numbers_of(body, numbers))
-
-
-def _measured(policy: str, rows: Path | None, body: Body, numbers: str | None) -> list[Turning]:
-    from esp_cli.bodies.numbers import numbers_of
-    from esp_cli.bodies.turning import policy_of, rows_of, turning
-
-    return turning(policy_of(policy), body, numbers_of(body, numbers), None if rows is None else rows_of(rows))
+    if model is None:
+        raise UserError(f"name the robot's model too: esp check {what} {name} robot.xml")
+    if rows is not None and what == "mirror":
+        raise UserError("--rows are observations that a policy meets; leave them out")
+    body = Body.from_mjcf(model, root, seconds=seconds)
+    if not body.found:
+        why = "".join(f" ({element}: {reason})" for element, reason in list(body.refused.items())[:1])
+        raise UserError(f"{model} has no mirror or turn{why}, so {name} cannot be compared with one")
+    numbers, found = numbers_of(body, order), {"model": str(model), "group": body.group}
+    if what == "mirror":
+        copies = audit(import_function(name), body, numbers)
+        console.result(json, {**found, "copies": copies}, lambda: _print_audit(name, copies))
+        return int(any(copy.wrong for copy in copies))
+    measured = turning(policy_of(name), body, numbers, None if rows is None else rows_of(rows))
+    console.result(json, {**found, "elements": measured}, lambda: _print_turning(name, measured))
+    return 0
 
 
 def _print_audit(name: str, copies: Sequence[Copy]) -> None:

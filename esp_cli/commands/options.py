@@ -228,6 +228,18 @@ SecondsOption = Annotated[
         "--seconds", min=1, help="Time for it; what does not fit in is not covered. Declared elements come first."
     ),
 ]
+RootOption = Annotated[
+    Path | None,
+    typer.Option("--root", help="Folder that holds all files of a robot; by default its own.", metavar="DIR"),
+]
+OrderOption = Annotated[
+    str | None,
+    typer.Option(
+        "--order",
+        help="Joints in your simulator's order, one a line; or a function that says what all your numbers are.",
+        metavar="FILE|MODULE:NAME",
+    ),
+]
 ForceOption = Annotated[bool, typer.Option("--force", help="Overwrite existing output.")]
 EpisodesOption = Annotated[
     int, typer.Option("--episodes", "-e", min=1, max=1_000_000, help="Episodes per seed.", metavar="COUNT")

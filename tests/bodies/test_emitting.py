@@ -204,7 +204,7 @@ def test_the_command_writes_audits_and_refuses(tmp_path, monkeypatch):
     Path("biped.xml").write_text(biped())
     told = esp("mirror", "biped.xml", "--emit", "rsl_rl", "-o", "my_mirror.py").stdout
     assert told.startswith("my_mirror.py has compute_symmetric_states for flip-x; policy: velocity 3, spin 3")
-    assert esp("mirror", "biped.xml", "--check", "my_mirror:compute_symmetric_states").stdout == (
+    assert esp("check", "mirror", "my_mirror:compute_symmetric_states", "biped.xml").stdout == (
         "my_mirror:compute_symmetric_states is right: its copies are identity, flip-x\n"
     )
     proof = [sys.executable, "-I", "test_my_mirror.py"]
@@ -215,16 +215,31 @@ def test_the_command_writes_audits_and_refuses(tmp_path, monkeypatch):
     assert b"AssertionError" in subprocess.run(proof, capture_output=True, check=False).stderr, "one sign is wrong"
     Path("my_mirror.py").write_text(right)
     Path("my_wrong.py").write_text(text)
-    result = esp("mirror", "biped.xml", "--check", "my_wrong:compute_symmetric_states", "--json", "-", code=1)
-    assert json.loads(result.stdout)["check"][1]["wrong"] == [["actions.waist", "actions.waist", "-actions.waist"]]
+    result = esp("check", "mirror", "my_wrong:compute_symmetric_states", "biped.xml", "--json", "-", code=1)
+    assert json.loads(result.stdout)["copies"][1]["wrong"] == [["actions.waist", "actions.waist", "-actions.waist"]]
     assert "exists" in refused("mirror", "biped.xml", "--emit", "numpy", "-o", "my_mirror.py")
     Path("my_mirror.py").unlink()
     assert "test_my_mirror.py exists" in refused("mirror", "biped.xml", "--emit", "numpy", "-o", "my_mirror.py")
     Path("my_mirror.py").write_text(right)
     assert "belong together" in refused("mirror", "biped.xml", "--emit", "numpy")
-    assert "cannot import" in refused("mirror", "biped.xml", "--check", "nowhere:mirror")
-    assert "names no function" in refused("mirror", "biped.xml", "--check", "nowhere")
-    assert "names no function" in refused("mirror", "biped.xml", "--check", "my_mirror:augment", "--numbers", "1")
+    assert "cannot import" in refused("check", "mirror", "nowhere:mirror", "biped.xml")
+    assert "names no function" in refused("check", "mirror", "nowhere", "biped.xml")
+    assert "names no function" in refused("check", "mirror", "my_mirror:augment", "biped.xml", "--order", "1:")
+    Path("order.txt").write_text("right_knee\nleft_knee\n\n waist \n")
+    esp("mirror", "biped.xml", "--emit", "numpy", "-o", "few.py", "--order", "order.txt")
+    assert "'actions.right_knee', 'actions.left_knee', 'actions.waist'" in Path("few.py").read_text()
+    esp("check", "mirror", "few:compute_symmetric_states", "biped.xml", "--order", "order.txt")
+    for text, words in (
+        ("left_knee", "the image of left_knee"),
+        ("knee", "there is no knee"),
+        ("\n", "no list of joints"),
+    ):
+        Path("order.txt").write_text(text)
+        assert words in refused("mirror", "biped.xml", "--emit", "numpy", "-o", "no.py", "--order", "order.txt")
+    assert "no.txt" in refused("mirror", "biped.xml", "--emit", "numpy", "-o", "no.py", "--order", "no.txt")
+    assert "add --emit" in refused("mirror", "biped.xml", "--order", "order.txt")
+    Path("biped.xml").write_text(biped(right_y=-0.2))
+    assert "has no mirror or turn" in refused("check", "mirror", "few:mirrored", "biped.xml")
 
 
 def test_joint_names_of_the_page_are_isaac_sims():

@@ -99,13 +99,16 @@ def test_the_command_measures_a_function(tmp_path, monkeypatch):
     Path("walking.py").write_text(
         "def act(rows):\n    return 2 * rows[:, 12:20]\n\ndef odd(rows):\n    return rows[:, :8]\n"
     )
-    right = esp("mirror", "robot.xml", "--policy", "walking:act", "--json", "-").stdout
-    assert [(one["element"], one["distance"]) for one in json.loads(right)["policy"]] == [
+    right = esp("check", "policy", "walking:act", "robot.xml", "--json", "-").stdout
+    assert [(one["element"], one["distance"]) for one in json.loads(right)["elements"]] == [
         (name, 0) for name in ("flip-x", "flip-y", "rot180")
     ]
-    told = esp("mirror", "robot.xml", "--policy", "walking:odd").stdout
+    told = esp("check", "policy", "walking:odd", "robot.xml").stdout
     assert "unrelated states" in told
-    assert "--rows are observations for --policy" in refused("mirror", "robot.xml", "--rows", "a.npy")
+    assert "--rows are observations" in refused("check", "mirror", "a:b", "robot.xml", "--rows", "a.npy")
+    assert "name the robot's model too" in refused("check", "policy", "walking:act")
+    assert "belong to tasks" in refused("check", "policy", "walking:act", "robot.xml", "--transforms", "d4")
+    assert "belong to 'esp check mirror|policy'" in refused("check", "task", "navigation", "robot.xml")
     np.save("rows.npy", np.ones((4, 3)))
-    said = refused("mirror", "robot.xml", "--policy", "walking:act", "--rows", "rows.npy")
+    said = refused("check", "policy", "walking:act", "robot.xml", "--rows", "rows.npy")
     assert "the rows have shape [4, 3]; give finite numbers [M, 36]" in said

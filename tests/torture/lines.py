@@ -56,7 +56,7 @@ class Lines:
         self.scratch.mkdir()
         robot = scratch / "robot.xml"
         robot.write_text(biped())
-        self.arguments = {"check": {"task": "navigation"}, "mirror": {"model": str(robot)}}
+        self.arguments = {"check": {"task": "navigation", "robot": str(robot)}, "mirror": {"model": str(robot)}}
         """Good ones, by command and name."""
         self.commands = {name: build_command(name, target) for name, target in COMMANDS.items()}
         self.settings = dict(_settings())
@@ -106,7 +106,7 @@ class Lines:
         options = [parameter for parameter in command.params if parameter.param_type_name == "option"]
         words = []
         for argument in command.params:
-            if argument.param_type_name == "argument":
+            if argument.param_type_name == "argument" and (argument.required or rng.random() < 0.5):
                 sound = typing.get_args(argument.type_descriptor.annotation) or ("nowhere", "no/such/place", "x" * 300)
                 if (good := self.arguments.get(name, {}).get(argument.name)) and rng.random() < 0.7:
                     sound = (good,)

@@ -190,7 +190,7 @@ class Models:
         """Run the command, with a file for a loop in most cases, and audit that file; return what is wrong."""
         proof = self.folder / "test_out.py"
         out, host, told = self.folder / "out.py", rng.choice(list(HOSTS)), rng.random() < 0.3
-        numbers = ["--numbers", "told:numbers"] if told else []
+        numbers = ["--order", "told:numbers"] if told else []
         words = ["mirror", path.name, "--json", "-"]
         if rng.random() < 0.8:
             words = ["mirror", path.name, "--emit", host, "-o", out.name, *numbers]
@@ -199,9 +199,7 @@ class Models:
             if wrong is None and out.exists():
                 wrong = _unlike_template(out, written) or _unlike_template(proof, proven)
                 if wrong is None and code == 0:
-                    _, wrong = self._run(
-                        ["mirror", path.name, "--check", "out:compute_symmetric_states", *numbers], (0,)
-                    )
+                    _, wrong = self._run(["check", "mirror", "out:compute_symmetric_states", path.name, *numbers], (0,))
             left = sorted(entry.name for entry in self.folder.iterdir() if entry not in (path, out, proof))
             if wrong is None and left != self._sound:
                 wrong = f"leaves {set(left) - set(self._sound)}"
