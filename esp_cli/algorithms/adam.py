@@ -162,6 +162,8 @@ def clip_per_seed(groups: Sequence[Tensor], max_norm: float) -> list[Tensor]:
         The norms [S] before, by group.
     """
     norms = torch.stack([torch.linalg.vector_norm(gradient, dim=1) for gradient in groups])
+    if norms.is_cpu and norms.max().item() + 1e-6 <= max_norm:  # a GPU would be waited for
+        return [*norms.unbind(0)]
     scales = (norms + 1e-6).reciprocal_().mul_(max_norm).clamp_max_(1.0).unsqueeze(2)
     for gradient, scale in zip(groups, scales.unbind(0), strict=True):
         gradient.mul_(scale)

@@ -141,7 +141,7 @@ def ppo_loss(head: Any, outputs: Any, copies: Copies[Any], clip_epsilon: float, 
             return Stated(lambda: stated()[0], share, policies.add_clipped_slope(slope, clipped))
         loss, by_log_ratio = stated()
         slope = policies.add_slope(slope, batch.action, by_log_ratio.mul_(by_objective), entropy_coef * by_objective)
-        return Stated(loss, share, slope)
+        return Stated(lambda: loss, share, slope)
 
     return Loss(Term(copies.policies(head, outputs), 1.0, equation))
 
@@ -176,10 +176,10 @@ def value_loss(
         share = shares(mask, error.shape)
         by_value.mul_(weight * share)
         if slope is None and learned == on.rows.shape[1]:
-            return Stated(error, share, by_value)
+            return Stated(lambda: error, share, by_value)
         slope = torch.zeros_like(on.rows) if slope is None else slope
         slope[:, :learned].add_(by_value)
-        return Stated(error, share, slope)
+        return Stated(lambda: error, share, slope)
 
     return Loss(Term(outputs, 1.0, equation))
 

@@ -26,6 +26,8 @@ Weights = Tensor | float  # A number, or [S, 1, R]
 class Policies(ABC):
     """What a network outputs for originals and copies, as policies."""
 
+    sizes: tuple[int, ...]  # S, P and R
+
     @abstractmethod
     def log_prob(self, action: Tensor, learned: int) -> Tensor:
         """Return log pi(action) [S, L, R] of the originals' actions [S, B, T, N(, W)]."""
@@ -64,7 +66,7 @@ class CategoricalPolicies(Policies):
         self._shape = logits.shape
         self.log_probs = torch.log_softmax(logits.movedim(-1, 1).flatten(3), 1)
         self.probs = self.log_probs.exp()
-        self._inner = self.probs * self.log_probs
+        self._inner, self.sizes = self.probs * self.log_probs, (len(logits), *self.probs.shape[2:])
 
     def log_prob(self, action: Tensor, learned: int) -> Tensor:
         return self.log_probs.gather(1, _index(action, learned)).squeeze(1)
@@ -73,9 +75,11 @@ class CategoricalPolicies(Policies):
         return self._inner[:, :, :learned].sum(1).neg_()
 
     def divergence(self, copies: slice, originals: slice) -> Tensor:
+        return self._gap(copies, originals).sum(1)
+
+    def _gap(self, copies: slice, originals: slice) -> Tensor:
         p, log_p, log_q = self.probs[:, :, copies], self.log_probs[:, :, copies], self.log_probs[:, :, originals]
-        self._gap = divergence_by_choice(log_p, log_q, p)
-        return self._gap.sum(1)
+        return divergence_by_choice(log_p, log_q, p)
 
     def add_slope(self, slope: Tensor | None, action: Tensor, by_log_prob: Tensor, by_entropy: Weights) -> Tensor:
         learned = by_log_prob.shape[1]
@@ -89,7 +93,7 @@ class CategoricalPolicies(Policies):
     def add_divergence_slope(self, slope: Tensor | None, weights: Weights, stop_gradient: str) -> Tensor:
         slope, weights = torch.zeros_like(self.probs) if slope is None else slope, _beside(weights)
         if stop_gradient != "transformed":
-            slope[:, :, 1:].add_(self._gap * weights)
+            slope[:, :, 1:].add_(self._gap(slice(1, None), slice(1)) * weights)
         if stop_gradient != "original":
             slope[:, :, :1].sub_((self.probs[:, :, 1:] * weights).sum(2, keepdim=True))
         return slope
@@ -109,6 +113,7 @@ class CompiledCategoricalPolicies(Policies):
         self._outputs, self._shape = outputs, outputs.tensor.shape
         rows = outputs.tensor.flatten(1, -2)
         self._choices = CompiledChoices(rows, orders.expand(len(rows), -1, -1))
+        self.sizes = (len(rows), orders.shape[1], rows.shape[1] // orders.shape[1])
 
     def log_prob(self, action: Tensor, learned: int) -> Tensor:
         return self._choices.numbers.log_probs.gather(1, _index(action, learned)).squeeze(1)
@@ -167,7 +172,7 @@ class GaussianPolicies(Policies):
         # [S, P, R, W], or [S, 1, 1, W] where all parts have their items in the same places
         self._item = item.expand(len(log_std), 1, 1, -1) if items is None else items.flatten(2, -2)
         self._log_std = log_std.detach().gather(1, self._item.flatten(1)).view(self._item.shape)
-        self._precision = (-self._log_std).exp()
+        self._precision, self.sizes = (-self._log_std).exp(), tuple(self._means.shape[:3])
 
     def log_prob(self, action: Tensor, learned: int) -> Tensor:
         square = self._standardised(action, learned).square()
@@ -178,10 +183,13 @@ class GaussianPolicies(Policies):
         return entropy.expand(self._means[:, :learned].shape[:-1])
 
     def divergence(self, copies: slice, originals: slice) -> Tensor:
-        self._gap = (self._means[:, copies] - self._means[:, originals]) * self._of(self._precision, originals)
-        log_ratio = 2 * (self._of(self._log_std, copies) - self._of(self._log_std, originals))
-        self._excess = log_ratio.exp() - 1
-        return 0.5 * (self._gap.square() + (self._excess - log_ratio)).sum(-1)
+        gap, log_ratio = self._gap(copies, originals)
+        return 0.5 * (gap.square() + (log_ratio.exp() - 1 - log_ratio)).sum(-1)
+
+    def _gap(self, copies: slice, originals: slice) -> tuple[Tensor, Tensor]:
+        """Return how far the means lie apart, in deviations of the originals, and the log ratio of the variances."""
+        gap = (self._means[:, copies] - self._means[:, originals]) * self._of(self._precision, originals)
+        return gap, 2 * (self._of(self._log_std, copies) - self._of(self._log_std, originals))
 
     def add_slope(
         self, slope: tuple[Tensor, Tensor] | None, action: Tensor, by_log_prob: Tensor, by_entropy: Weights
@@ -199,8 +207,9 @@ class GaussianPolicies(Policies):
     ) -> tuple[Tensor, Tensor]:
         by_means, by_log_std = slope or self._no_slope()
         weights = weights.unsqueeze(-1) if isinstance(weights, Tensor) else weights
-        weighted, excess = self._gap * weights, self._excess * weights
-        self._add_by_items(by_log_std, -(weighted * self._gap) - excess, slice(1))
+        gap, log_ratio = self._gap(slice(1, None), slice(1))
+        weighted, excess = gap * weights, (log_ratio.exp() - 1) * weights
+        self._add_by_items(by_log_std, -(weighted * gap) - excess, slice(1))
         if len(self._item[0]) > 1:
             self._add_by_items(by_log_std, excess, slice(1, None))
         weighted.mul_(self._of(self._precision, slice(1)))

@@ -20,8 +20,8 @@ from esp_cli.symmetry.frame import Frame
 class Stated(NamedTuple):
     """An equation, evaluated."""
 
-    # [S, P, R], whose mean it is; or a number per seed [S], or one []; or what computes it where somebody asks
-    elements: Tensor | Callable[[], Tensor]
+    # computes, where somebody asks, [S, P, R], whose mean it is; or a number per seed [S], or one []
+    elements: Callable[[], Tensor]
     share: Tensor | float | None  # of each element in the mean of its seed; see `shares`. None for a number.
     slope: Any  # that of the terms before, or None, with its own times its weight added
 
@@ -78,7 +78,7 @@ class Loss:
         total = torch.zeros(())
         for weight, elements, share in self._evaluate()[0]:
             with torch.no_grad():
-                x = elements() if callable(elements) else elements
+                x = elements()
             total = total + weight * (x if share is None else average(x, share))
         return total
 
@@ -155,7 +155,7 @@ class _WithSlope(Function):
 
 def _itself(on: OfGraph, weight: float, slope: Tensor | None) -> Stated:
     own = torch.full_like(on.tensor, weight)
-    return Stated(on.tensor, None, own if slope is None else slope + own)
+    return Stated(lambda: on.tensor, None, own if slope is None else slope + own)
 
 
 def policy_consistency_loss(
@@ -191,9 +191,10 @@ def policy_gap(mask: Tensor | None, stop_gradient: str) -> Equation:
     """Return the mean of S_pi over copies and rows that count, as an equation on `networks.policies.Policies`."""
 
     def equation(policies: Any, weight: float, slope: Any) -> Stated:
-        gap = policy_consistency_loss(policies.divergence, slice(1, None), slice(0, 1))
-        share = shares(mask, gap.shape)
-        return Stated(gap, share, policies.add_divergence_slope(slope, weight * share, stop_gradient))
+        num_seeds, num_parts, num_rows = policies.sizes
+        share = shares(mask, (num_seeds, num_parts - 1, num_rows))
+        slope = policies.add_divergence_slope(slope, weight * share, stop_gradient)
+        return Stated(lambda: policy_consistency_loss(policies.divergence, slice(1, None), slice(0, 1)), share, slope)
 
     return equation
 
@@ -204,13 +205,12 @@ def value_gap(mask: Tensor | None, stop_gradient: str) -> Equation:
     def equation(values: Values, weight: float, slope: Tensor | None) -> Stated:
         slope = torch.zeros_like(values.rows) if slope is None else slope
         here, copies = values.rows[:, :1], values.rows[:, 1:]
-        gap = value_consistency_loss(copies, here)
-        share = shares(mask, gap.shape)
-        by_copies = (copies - here).mul_(2 * weight * share)
+        share, by_copies = shares(mask, copies.shape), copies - here
+        by_copies.mul_(2 * weight * share)
         if stop_gradient != "transformed":
             slope[:, 1:].add_(by_copies)
         if stop_gradient != "original":
-            slope[:, :1].sub_(by_copies.sum(1, keepdim=True))
-        return Stated(gap, share, slope)
+            slope[:, :1].sub_(by_copies if by_copies.shape[1] == 1 else by_copies.sum(1, keepdim=True))
+        return Stated(lambda: value_consistency_loss(copies, here), share, slope)
 
     return equation

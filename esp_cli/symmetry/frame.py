@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from esp_cli.symmetry.maps import Gather
 from esp_cli.symmetry.transforms import Transform
 
 
@@ -45,13 +44,15 @@ class Frame:
 
     def orders(self, num_actions: int) -> Tensor | None:
         """Return which output of each part is the original's action [S or 1, 1 + K, A]."""
-        maps = [g.output_map for g in self._transforms]
-        backs = [m.back for m in maps if isinstance(m, Gather) and m.sign is None]
-        if self._moves_agents or len(backs) < len(self._transforms):
+        if not self._transforms:
+            return torch.arange(num_actions).view(1, 1, -1)
+        orders = [order for g in self._transforms if (order := g.orders) is not None]
+        if len(orders) < len(self._transforms):
             return None
-        num_seeds = max((len(back) for back in backs), default=1)
-        stays = torch.arange(num_actions).expand(num_seeds, -1)
-        return torch.stack([stays, *(back.expand(num_seeds, -1) for back in backs)], 1)
+        if len(orders) == 1:
+            return orders[0]
+        orders = [order.expand(max(map(len, orders)), -1, -1) for order in orders]
+        return torch.cat([orders[0][:, :1], *(order[:, 1:] for order in orders)], 1)
 
     def pull_values(self, values: Tensor) -> Tensor:
         """Return values [S, (1 + K) B, ..., C] in the frame: [S, 1 + K, B, ..., C]."""

@@ -10,7 +10,9 @@ Shape:
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
+from math import isfinite
 
 import numpy as np
 import torch
@@ -58,11 +60,12 @@ class Dense:
 
 def _product(rows: Tensor, matrix: Tensor) -> Tensor:
     """Return rows [S, B, width] times matrices, where 0 times inf or NaN is 0, in the type of the rows."""
-    with torch.autocast(rows.device.type, enabled=False):
+    kind = rows.device.type
+    with torch.autocast(kind, enabled=False) if torch.is_autocast_enabled(kind) else nullcontext():
         matrix = matrix.to(rows.dtype)
         if rows.is_cpu and not torch.compiler.is_compiling():  # a GPU would be waited for
             product = torch.bmm(rows, matrix)
-            if product.detach().sum().isfinite():
+            if isfinite(product.sum().item()):
                 return product
         product = torch.bmm(rows.where(rows.isfinite(), 0.0), matrix)
         high, low = (~(rows < torch.inf)).to(matrix), (~(rows > -torch.inf)).to(matrix)  # NaN, as inf - inf, is both

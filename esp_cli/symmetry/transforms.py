@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -63,6 +64,14 @@ class Transform:
         """Whether it moves no number of the task, as a turn of scalars alone."""
         maps = (self.obs_map, self.state_map, self.output_map)
         return all(m.is_identity for m in maps) and (self.agents is None or self.agents.is_identity)
+
+    @cached_property
+    def orders(self) -> Tensor | None:
+        """Which output is each action's, at s and at L_g s, [S, 2, A] int64; None where signs change or agents move."""
+        by = self.output_map
+        if self.agents is not None or not isinstance(by, Gather) or by.sign is not None:
+            return None
+        return torch.stack([torch.arange(by.width).expand_as(by.back), by.back], 1)
 
     @property
     def num_outputs(self) -> int:

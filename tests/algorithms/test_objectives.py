@@ -16,7 +16,7 @@ from esp_cli.algorithms.objectives import clipped_surrogate, ppo_loss, value_err
 from esp_cli.networks.heads import Categorical
 from esp_cli.networks.plain import MlpConfig
 from esp_cli.networks.policy import StochasticPolicy
-from esp_cli.prior import Loss, PriorConfig, SeedBatch, SymmetryPrior, copies, losses, mean_per_seed
+from esp_cli.prior import Loss, PriorConfig, SeedBatch, SymmetryPrior, copies, mean_per_seed
 from esp_cli.prior.losses import policy_consistency_loss, value_consistency_loss
 from esp_cli.symmetry import transform_set
 from esp_envs import Field, Kind, Spaces, layout
@@ -327,26 +327,22 @@ def test_every_gradient_of_a_default_run_goes_through_the_equations(monkeypatch)
     counted(mappo, "ppo_loss")
     for module in (mappo, maddpg, qmix, off_policy):
         counted(module, "value_loss")
-    counted(losses, "policy_consistency_loss")
-    counted(losses, "value_consistency_loss")
+    counted(copies, "policy_gap")
+    counted(copies, "value_gap")
     counted(copies.Copies, "penalty")
     counted(mappo.SeedAdam, "gradient")
     trained = learner()
     trained.iterate(0.0)
     # two epochs of two minibatches; the last epoch's value losses are logged, and the symmetry errors measured once
     steps = {"gradient": 4, "ppo_loss": 4, "penalty": 4, "value_loss": 4 + 2}
-    assert counts == steps | {"policy_consistency_loss": 4 + 1, "value_consistency_loss": 4 + 1}
+    assert counts == steps | {"policy_gap": 4 + 1, "value_gap": 4 + 1}
     for algorithm, actor in (("maddpg", 1), ("qmix", 0)):
         trained = learners.learner(algorithm)
         batch = [trained.iterate(0.0), trained.iterate(0.0)] and trained.replay.sample(3, trained.generators["learner"])
         counts.clear()
         trained.update(batch)
-        assert counts == {
-            "gradient": 1 + actor,
-            "penalty": 1 + actor,
-            "value_loss": 2,
-            "value_consistency_loss": 1,
-        } | ({"policy_consistency_loss": 1} if actor else {})
+        once = {"policy_gap": 1, "value_gap": 1} if actor else {"value_gap": 1}
+        assert counts == {"gradient": 1 + actor, "penalty": 1 + actor, "value_loss": 2} | once
 
 
 @pytest.mark.parametrize(
@@ -354,10 +350,10 @@ def test_every_gradient_of_a_default_run_goes_through_the_equations(monkeypatch)
     [
         ("Eq. 3", {"ppo_loss"}),
         ("Eq. 4", {"value_loss"}),
-        ("Eq. 8, S_pi", {"policy_consistency_loss"}),
-        ("Eq. 9, S_V", {"value_consistency_loss"}),
+        ("Eq. 8, S_pi", {"policy_gap"}),
+        ("Eq. 9, S_V", {"value_gap"}),
         ("Eq. 10, c", {"Copies.penalty"}),
-        ("supplement eq. 19, S_Q", {"value_consistency_loss"}),
+        ("supplement eq. 19, S_Q", {"value_gap"}),
     ],
 )
 def test_the_page_points_at_the_functions_that_are_counted_above(equation, functions):

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 from itertools import accumulate, pairwise
 from math import prod
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -24,10 +24,6 @@ class _Columns(ctypes.Structure):
         *fields(ctypes.c_int64, "width", "seed", "column"),
         *fields(ctypes.c_int64 * _AXES, "sizes", "strides"),
     )
-
-    @classmethod
-    def of(cls, x: Tensor, sizes: Sequence[int], strides: Sequence[int]) -> _Columns:
-        return cls(x.data_ptr(), x.shape[-1], x.stride(0), x.stride(-1), tuple(sizes), tuple(strides))
 
 
 class _Perceptron(ctypes.Structure):
@@ -59,31 +55,74 @@ def _whole_rows(x: Tensor) -> Tensor:
     return x if column == 1 and row == x.shape[2] else x.detach().contiguous()
 
 
-def _counted(x: Tensor) -> tuple[Tensor, tuple[int, ...], tuple[int, ...]]:
-    """Return x [S, ..., d], copied where need be, and sizes and strides of few axes that count its rows."""
+Lies = tuple[torch.Size, tuple[int, ...], torch.dtype]  # shape, strides and type of a tensor
+
+
+def _lies(x: Tensor) -> Lies:
+    return x.shape, x.stride(), x.dtype
+
+
+@lru_cache
+def _counted(shape: torch.Size, steps: tuple[int, ...]) -> tuple[tuple[int, ...], tuple[int, ...]] | None:
+    """Return sizes and strides of few axes that count the rows of inputs [S, ..., d]; None where these are too few."""
+    if not shape.numel():
+        return (1, 1, 0), (0, 0, 0)
     sizes, strides = [1] * _AXES, [0] * _AXES
-    for size, stride in zip(x.shape[1:-1], x.stride()[1:-1], strict=True):
+    for size, stride in zip(shape[1:-1], steps[1:-1], strict=True):
         if sizes[-1] == 1 or strides[-1] == size * stride:
             sizes[-1], strides[-1] = sizes[-1] * size, stride
         elif size > 1:
             sizes, strides = [*sizes, size], [*strides, stride]
     while len(sizes) > _AXES and sizes[0] == 1:
         del sizes[0], strides[0]
-    if len(sizes) > _AXES:
-        return _counted(x.contiguous()) if x.numel() else (x, (1, 1, 0), (0, 0, 0))
-    return x, tuple(sizes), tuple(strides)
+    return (tuple(sizes), tuple(strides)) if len(sizes) == _AXES else None
 
 
-@lru_cache
-def _tables(
-    widths: tuple[int, ...], addresses: tuple[int, ...], strides: tuple[int, ...]
-) -> tuple[ctypes.Array[Any], ...]:
-    """Return what does not change from pass to pass of a network, as the kernel reads it."""
-    return (
-        (ctypes.c_int64 * len(widths))(*widths),
-        (ctypes.c_void_p * len(addresses))(*addresses),
-        (ctypes.c_int64 * len(strides))(*strides),
-    )
+class _Plan:
+    """What does not change from pass to pass of a network whose inputs lie alike.
+
+    Args:
+        inputs: how they lie.
+        parameters: where they begin, and how they lie.
+        activate_output: see `Shape`.
+        others: "tanh", "threads" and "things" of `_Perceptron`.
+    """
+
+    def __init__(
+        self, inputs: Sequence[Lies], parameters: Sequence[tuple[int, Lies]], activate_output: bool, **others: int
+    ) -> None:
+        lies = [where for _, where in parameters]
+        self.inputs, self.shapes = [shape[-1] for shape, *_ in inputs], [shape[1:] for shape, *_ in lies]
+        self.widths = (sum(self.inputs), *(size[1] for size in self.shapes[1::2]))
+        self.size = (lies[0][0][0], prod(inputs[0][0][1:-1]))
+        if self.widths[0] != self.shapes[0][0] or any(
+            (x[0], prod(x[1:-1])) != self.size or kind != torch.float32 for x, _, kind in inputs
+        ):
+            shapes = ", ".join(f"{kind} {list(shape)}" for shape, _, kind in inputs)
+            raise UserError(f"a perceptron for float32 rows [{self.size[0]}, ..., {self.shapes[0][0]}] got {shapes}")
+        self.count = sum(map(torch.Size.numel, self.shapes))
+        activated = self.widths[1:] if activate_output else self.widths[1:-1]
+        self.room = prod(self.size) * sum(map(padded, activated))
+        columns = [_Columns(None, x[-1], steps[0], steps[-1], *(_counted(x, steps) or ())) for x, steps, _ in inputs]
+        self.columns = (_Columns * len(columns))(*columns)
+        self._tables = (
+            (ctypes.c_int64 * len(self.widths))(*self.widths),
+            (ctypes.c_void_p * len(lies))(*(at for at, _ in parameters)),
+            (ctypes.c_int64 * len(lies))(*(steps[0] for _, steps, _ in lies)),
+        )
+        widths, at, strides = map(ctypes.addressof, self._tables)
+        seeds, rows = self.size
+        self.arguments = _Perceptron(
+            seeds=seeds, rows=rows, layers=len(self.widths) - 1, activate_output=activate_output, parts=len(columns),
+            widths=widths, parameters=at, strides=strides, **others,
+        )  # fmt: skip
+
+
+@lru_cache(maxsize=256)
+def _plan(
+    inputs: tuple[Lies, ...], parameters: tuple[tuple[int, Lies], ...], activate_output: bool, **others: int
+) -> _Plan:
+    return _Plan(inputs, parameters, activate_output, **others)
 
 
 class CompiledPass:
@@ -105,35 +144,26 @@ class CompiledPass:
         keep: bool = True,
         things: int = 1,
     ) -> None:
-        parts = [_counted(x.detach()) for x in inputs]
+        inputs = [x if _counted(x.shape, x.stride()) else x.detach().contiguous() for x in inputs]
         given = [_whole_rows(p) for p in parameters]
-        self._inputs = [x.shape[-1] for x in inputs]
-        self._shapes = [p.shape[1:] for p in parameters]
-        self._widths = (sum(self._inputs), *(size[1] for size in self._shapes[1::2]))
-        self._size = (parameters[0].shape[0], prod(inputs[0].shape[1:-1]))
-        if self._widths[0] != self._shapes[0][0] or any(
-            (x.shape[0], prod(x.shape[1:-1])) != self._size or x.dtype != torch.float32 for x in inputs
-        ):
-            shapes = ", ".join(f"{x.dtype} {list(x.shape)}" for x in inputs)
-            raise UserError(f"a perceptron for float32 rows [{self._size[0]}, ..., {self._shapes[0][0]}] got {shapes}")
-        activated = self._widths[1:] if activate_output else self._widths[1:-1]
-        room = prod(self._size) * sum(map(padded, activated))
-        hidden = given[0].new_empty(room) if keep and not self.computes_again else None
-        columns = (_Columns * len(parts))(*(_Columns.of(*part) for part in parts))
-        tables = _tables(self._widths, tuple(p.data_ptr() for p in given), tuple(p.stride(0) for p in given))
-        self._arguments = _Perceptron(
-            *self._size,
-            len(self._widths) - 1,
-            activation == "tanh",
+        self._plan = plan = _plan(
+            tuple(map(_lies, inputs)),
+            tuple((p.data_ptr(), _lies(p)) for p in given),
             activate_output,
-            torch.get_num_threads(),
-            len(parts),
-            things,
-            *map(ctypes.addressof, (*tables, columns)),
-            None if hidden is None else hidden.data_ptr(),
+            tanh=activation == "tanh",
+            threads=torch.get_num_threads(),
+            things=things,
         )
-        self._alive = (parts, [p.detach() for p in given] if keep else given, hidden, tables, columns)
-        self.outputs = self._passed(given[0], rows_innermost or self._widths[-1] < PADDING)
+        self._size = plan.size
+        hidden = given[0].new_empty(plan.room) if keep and not self.computes_again else None
+        columns = type(plan.columns).from_buffer_copy(plan.columns)
+        for part, x in zip(columns, inputs, strict=True):
+            part.at = x.data_ptr()
+        self._arguments = _Perceptron.from_buffer_copy(plan.arguments)
+        self._arguments.inputs = ctypes.addressof(columns)
+        self._arguments.hidden = None if hidden is None else hidden.data_ptr()
+        self._alive = (inputs, given, hidden, columns)
+        self.outputs = self._passed(given[0], rows_innermost or plan.widths[-1] < PADDING)
 
     def backward(self, grad: Tensor) -> list[Tensor]:
         """Return the gradients by all parameters, side by side [S, P], of what has this gradient by the outputs."""
@@ -146,7 +176,7 @@ class CompiledPass:
     ) -> tuple[list[Tensor | None], list[Tensor | None]]:
         """Return the gradients by the parameters that learn and by the inputs that ask; None for the others."""
         found = self._room(grad) if any(learns) else None
-        ends = pairwise(accumulate(self._inputs, initial=0))
+        ends = pairwise(accumulate(self._plan.inputs, initial=0))
         columns = [at if wanted else None for wanted, at in zip(asked, ends, strict=False)]
         wanted = [at for at in columns if at]
         first, end = (wanted[0][0], wanted[-1][1]) if wanted else (0, 0)
@@ -156,7 +186,7 @@ class CompiledPass:
 
     def _passed(self, like: Tensor, columns_first: bool) -> Tensor:
         """Go through all layers and return what the last one gives."""
-        (num_seeds, num_rows), width = self._size, self._widths[-1]
+        (num_seeds, num_rows), width = self._size, self._plan.widths[-1]
         size = (num_seeds, width, num_rows) if columns_first else (num_seeds, num_rows, width)
         outputs = like.new_empty(size)
         outputs = outputs.transpose(1, 2) if columns_first else outputs
@@ -169,12 +199,13 @@ class CompiledPass:
 
     def _room(self, like: Tensor) -> Tensor:
         """Return an empty buffer [S, P] for the gradients by all parameters."""
-        return like.new_empty(self._size[0], sum(map(torch.Size.numel, self._shapes)))
+        return like.new_empty(self._size[0], self._plan.count)
 
     def _split(self, found: Tensor | None, learns: Sequence[bool]) -> list[Tensor | None]:
         """Return the part of a buffer [S, P] that belongs to each parameter, where it learns."""
-        ends = pairwise(accumulate(map(torch.Size.numel, self._shapes), initial=0))
+        shapes = self._plan.shapes
+        parts = [None] * len(shapes) if found is None else found.split([size.numel() for size in shapes], 1)
         return [
-            None if found is None or not wanted else found[:, begin:end].unflatten(1, size)
-            for wanted, (begin, end), size in zip(learns, ends, self._shapes, strict=True)
+            None if part is None or not wanted else part.unflatten(1, size)
+            for wanted, part, size in zip(learns, parts, shapes, strict=True)
         ]

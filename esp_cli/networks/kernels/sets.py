@@ -66,7 +66,7 @@ class _PooledPass(CompiledPass):
         super().__init__(parts, parameters, activation, True, keep=keep, things=self._sets[2])
 
     def _passed(self, like: Tensor, columns_first: bool) -> Tensor:
-        outputs = like.new_empty(*self._sets[:2], 2 * self._widths[-1])
+        outputs = like.new_empty(*self._sets[:2], 2 * self._plan.widths[-1])
         call("sets", "pool", self._arguments, RowsAt.of(outputs), _rows(self.each))
         return outputs
 
