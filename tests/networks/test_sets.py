@@ -314,6 +314,28 @@ def test_qmix_learns_with_a_mixer_over_a_set():
     assert any(not torch.equal(p, before[n]) for n, p in learner.mixer.named_parameters())
 
 
+@needs_compiler
+@pytest.mark.parametrize("reads", ["state", "observations"])
+@pytest.mark.parametrize(
+    "network",
+    [{"name": "set"}, {"name": "set", "memory": True}, {"name": "set-equivariant"}],
+    ids=["set", "memory", "equivariant"],
+)
+def test_mappo_with_compiled_sets_learns_as_by_torch(network, reads):
+    def trained(compiled):
+        small = {"mappo.num_envs": 4, "mappo.num_epochs": 2, "mappo.num_minibatches": 2, "mappo.critic_input": reads}
+        chosen = {f"network.{name}": value for name, value in network.items()} | {"network.compiled": compiled}
+        learner = build_learner(resolve_config("navigation", seeds=[0, 1], overrides=chosen | small))
+        for _ in range(2):
+            assert bool(learner.iterate(0.5).finite.all())
+        return {n: p for n, p in learner.state_dict().items() if n.startswith(("policy", "critic")) and p.dim() == 3}
+
+    kernel, plain = trained(compiled=True), trained(compiled=False)
+    assert kernel.keys() == plain.keys()
+    for n, p in kernel.items():
+        torch.testing.assert_close(p, plain[n], atol=1e-4, rtol=1e-4, msg=n)
+
+
 OFF = {"maddpg.num_envs": 4, "maddpg.batch_episodes": 4, "maddpg.warmup_episodes": 2}
 
 

@@ -65,8 +65,8 @@ def _lies(x: Tensor) -> Lies:
 @lru_cache
 def _counted(shape: torch.Size, steps: tuple[int, ...]) -> tuple[tuple[int, ...], tuple[int, ...]] | None:
     """Return sizes and strides of few axes that count the rows of inputs [S, ..., d]; None where these are too few."""
-    if not shape.numel():
-        return (1, 1, 0), (0, 0, 0)
+    if not shape.numel():  # no rows, or rows of no numbers: a part of a set's inputs that is empty
+        return (1, 1, max(1, prod(shape[1:-1]))), (0, 0, 0)
     sizes, strides = [1] * _AXES, [0] * _AXES
     for size, stride in zip(shape[1:-1], steps[1:-1], strict=True):
         if sizes[-1] == 1 or strides[-1] == size * stride:

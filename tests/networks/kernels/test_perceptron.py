@@ -131,6 +131,7 @@ def test_rows_along_more_axes_than_the_kernel_counts_are_copied():
     x = torch.randn(2, 3, 4, 5, 2, 1).permute(5, 3, 0, 2, 1, 4)
     torch.testing.assert_close(mlp(x).flatten(1, -2), reference(mlp, x.flatten(1, -2)), rtol=1e-5, atol=1e-5)
     assert mlp(x[:, :, :0]).shape == (1, *x[:, :, :0].shape[1:-1], 3)
+    torch.testing.assert_close(mlp(x, x[..., :0]), mlp(x), rtol=0, atol=0)  # a part of no numbers
 
 
 @needs_compiler
