@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import huber_loss
 
 from esp_cli.networks.kernels.choices import Clipped
+from esp_cli.networks.kernels.values import Regression
 from esp_cli.networks.policies import CompiledCategoricalPolicies, Policies
 from esp_cli.prior import Copies, Loss, Term, mean_per_seed, shares
 from esp_cli.prior.losses import Stated, Values
@@ -172,10 +173,16 @@ def value_loss(
     target = target.flatten(1).unsqueeze(1)
 
     def equation(on: Values, weight: float, slope: Tensor | None) -> Stated:
-        error, by_value = value_error(on.rows[:, :learned], target, huber_delta, old, clip_epsilon or 0.0)
-        share = shares(mask, error.shape)
+        def stated() -> tuple[Tensor, Tensor]:
+            return value_error(on.rows[:, :learned], target, huber_delta, old, clip_epsilon or 0.0)
+
+        share = shares(mask, (on.sizes[0], learned, on.sizes[2]))
+        if on.defers and slope is None and old is None and isinstance(share, float):
+            asked = Regression(target, learned, huber_delta, weight * share)
+            return Stated(lambda: stated()[0], share, asked)
+        error, by_value = stated()
         by_value.mul_(weight * share)
-        if slope is None and learned == on.rows.shape[1]:
+        if slope is None and learned == on.sizes[1]:
             return Stated(lambda: error, share, by_value)
         slope = torch.zeros_like(on.rows) if slope is None else slope
         slope[:, :learned].add_(by_value)

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Annotated, ClassVar, Literal, NamedTuple
+from typing import Annotated, ClassVar, Literal
 
 import torch
 from pydantic import Field
@@ -182,13 +182,21 @@ class Network(nn.Module, ABC):
 
         return outputs.detach(), vjp
 
+    def deferred(self, x: Tensor, parameters: Sequence[Tensor], shape: Sequence[int]) -> WithVJP | None:
+        """Return what `unroll_agents` would, in a shape, where a kernel may compute it together with a loss; or None.
 
-class WithVJP(NamedTuple):
-    """What a network returned, and the way back from slopes by it."""
+        `parameters` are all of the network's.
+        """
+        return None
 
-    tensor: Tensor  # without a graph
-    vjp: VJP  # see `VJP`
-    parameters: Sequence[Tensor]  # that the VJP gives the slopes by
+
+class WithVJP:
+    """What a network returned, `tensor` without a graph, and the way back from slopes by it to some parameters."""
+
+    waits = False  # whether nothing is computed yet; see `networks.perceptron.Deferred`
+
+    def __init__(self, tensor: Tensor, vjp: VJP, parameters: Sequence[Tensor]) -> None:
+        self.tensor, self.vjp, self.parameters, self.size = tensor, vjp, parameters, tensor.shape
 
 
 class Memoryless(Network):

@@ -127,7 +127,8 @@ class Categorical(Choice):
 
     def policies(self, outputs: WithVJP, frame: Frame) -> Policies:
         """Return the policies that outputs [S, P B, T, N, A] are, for losses with slopes."""
-        orders = frame.orders(self.num_outputs) if computes(self.compiled, outputs.tensor) else None
+        compiled = outputs.waits or computes(self.compiled, outputs.tensor)
+        orders = frame.orders(self.num_outputs) if compiled else None
         return CategoricalPolicies(outputs, frame) if orders is None else CompiledCategoricalPolicies(outputs, orders)
 
 

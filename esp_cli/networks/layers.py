@@ -12,8 +12,8 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
-from esp_cli.networks.kernels.library import library
-from esp_cli.networks.perceptron import Shape, activate_, affine, perceptron, perceptron_with_vjp
+from esp_cli.networks.kernels.library import computes, library
+from esp_cli.networks.perceptron import Deferred, Shape, activate_, affine, perceptron, perceptron_with_vjp
 
 # orthogonal gain of a hidden layer, as in the MAPPO paper's code (torch.nn.init.calculate_gain)
 GAINS = {"relu": math.sqrt(2.0), "tanh": 5.0 / 3.0}
@@ -121,6 +121,11 @@ class SeedMLP(nn.Module):
     def forward_with_vjp(self, x: Tensor) -> tuple[Tensor, Callable[[Tensor], list[Tensor]]]:
         """Map [S, ..., in] as `forward` does, without a graph, and return the VJP; not with layer normalisation."""
         return perceptron_with_vjp(self._shape(), [x], self._from(0))
+
+    def deferred(self, x: Tensor, parameters: Sequence[Tensor], shape: Sequence[int]) -> Deferred | None:
+        """Return what `forward` gives for x [S, ..., in] in another shape, where the kernel is chosen; see there."""
+        chosen = self.norms is None and not self.activate_output and computes(self.compiled, x)
+        return Deferred(self._shape(), x, parameters, shape) if chosen else None
 
     def _from_layer(self, first: int, parts: Sequence[Tensor], rows_innermost: bool = False) -> Tensor:
         return perceptron(self._shape(rows_innermost), parts, self._from(first))

@@ -8,6 +8,7 @@ the same and is the reference in the tests.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property
 from itertools import accumulate, pairwise
 from typing import NamedTuple
 
@@ -15,8 +16,9 @@ import torch
 from torch import Tensor
 from torch.autograd import Function
 
+from esp_cli.networks.contract import WithVJP
 from esp_cli.networks.kernels.library import computes
-from esp_cli.networks.kernels.perceptron import CompiledPass
+from esp_cli.networks.kernels.perceptron import CompiledPass, LearningPass
 
 # rows, over all seeds, that go through a perceptron at once: what is kept of them fits a processor's cache
 CACHED_ROWS = 4096
@@ -56,6 +58,37 @@ def perceptron_with_vjp(
     with torch.no_grad():
         run = _pass(shape, inputs, parameters, keep=True)
     return run.outputs.unflatten(1, inputs[0].shape[1:-1]), lambda slope: run.backward(slope.flatten(1, -2))
+
+
+class Deferred(WithVJP):
+    """What a compiled perceptron returns for rows, computed where somebody asks for it; see `learn`."""
+
+    def __init__(self, shape: Shape, rows: Tensor, parameters: Sequence[Tensor], size: Sequence[int]) -> None:
+        self._shape, self._rows, self.parameters, self.size = shape, rows, parameters, size
+
+    @cached_property
+    def _run(self) -> CompiledPass:
+        return CompiledPass([self._rows], self.parameters, self._shape.activation, False)
+
+    @property
+    def waits(self) -> bool:  # type: ignore[override]
+        return "_run" not in self.__dict__
+
+    @property
+    def tensor(self) -> Tensor:  # type: ignore[override]
+        return self._run.outputs.unflatten(1, self._rows.shape[1:-1]).reshape(self.size)
+
+    def vjp(self, slope: Tensor) -> list[Tensor]:  # type: ignore[override]
+        return self._run.backward(slope.reshape(self._run.outputs.shape))
+
+    def learn(self, loss: Callable[[LearningPass], Tensor], parts: int) -> WithVJP:
+        """Return the gradients of a loss of P parts, which follow each other in the rows, as if they were a VJP's.
+
+        Outputs and slope are computed block by block and kept nowhere.
+        """
+        rows = self._rows.flatten(1, -2).unflatten(1, (parts, -1)).transpose(1, 2)
+        run = LearningPass(rows, self.parameters, self._shape.activation)
+        return WithVJP(rows, lambda _: [loss(run)], self.parameters)
 
 
 def _pass(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor], keep: bool) -> _Pass | CompiledPass:

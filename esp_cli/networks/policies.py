@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from functools import cached_property
+from math import prod
 from typing import Any
 
 import torch
@@ -16,6 +18,7 @@ from torch import Tensor
 
 from esp_cli.networks.contract import WithVJP
 from esp_cli.networks.kernels.choices import Clipped, CompiledChoices, Slope
+from esp_cli.networks.perceptron import Deferred
 from esp_cli.symmetry.frame import Frame
 
 _HALF_LOG_TAU = 0.5 * math.log(2 * math.pi)
@@ -110,10 +113,14 @@ class CompiledCategoricalPolicies(Policies):
     """
 
     def __init__(self, outputs: WithVJP, orders: Tensor) -> None:
-        self._outputs, self._shape = outputs, outputs.tensor.shape
-        rows = outputs.tensor.flatten(1, -2)
-        self._choices = CompiledChoices(rows, orders.expand(len(rows), -1, -1))
-        self.sizes = (len(rows), orders.shape[1], rows.shape[1] // orders.shape[1])
+        self._outputs = outputs
+        num_seeds, *rows, _ = outputs.size
+        self._orders = orders.expand(num_seeds, -1, -1)
+        self.sizes = (num_seeds, orders.shape[1], prod(rows) // orders.shape[1])
+
+    @cached_property
+    def _choices(self) -> CompiledChoices:
+        return CompiledChoices(self._outputs.tensor.flatten(1, -2), self._orders)
 
     def log_prob(self, action: Tensor, learned: int) -> Tensor:
         return self._choices.numbers.log_probs.gather(1, _index(action, learned)).squeeze(1)
@@ -138,8 +145,11 @@ class CompiledCategoricalPolicies(Policies):
         return [*before, last._replace(gaps=gaps)] if last.gaps is None else [*before, last, Slope(gaps=gaps)]
 
     def back(self, slope: list[Slope]) -> list[tuple[WithVJP, Tensor]]:
+        outputs = self._outputs
+        if isinstance(outputs, Deferred) and outputs.waits and len(slope) == 1:
+            return [(outputs.learn(lambda run: slope[0].learn(run, self._orders), self.sizes[1]), self._orders)]
         first, *others = map(self._choices.back, slope)
-        return [(self._outputs, sum(others, start=first).unflatten(1, self._shape[1:-1]))]
+        return [(outputs, sum(others, start=first).unflatten(1, outputs.size[1:-1]))]
 
 
 def divergence_by_choice(log_p: Tensor, log_q: Tensor, p: Tensor) -> Tensor:

@@ -90,6 +90,9 @@ class StochasticPolicy(Policy):
 
     def unroll_with_vjp(self, obs: Tensor, truncation: int = 0, action_mask: Tensor | None = None) -> WithVJP:
         """Return the outputs as they are but for the mask, for losses; see `unroll`."""
+        shape = (*obs.shape[:-1], self.head.num_outputs)
+        if action_mask is None and (later := self.actor.deferred(obs, self._learned, shape)) is not None:
+            return later
         outputs, vjp = self.actor.unroll_with_vjp(obs, truncation)
         return WithVJP(masked(outputs, action_mask), vjp, self._learned)
 
@@ -185,7 +188,10 @@ class Critic(nn.Module):
         return self._values(self.network.unroll_agents(self._rows(obs, state), truncation))
 
     def unroll_with_vjp(self, obs: Tensor, state: Tensor, truncation: int = 0) -> WithVJP:
-        outputs, vjp = self.network.unroll_with_vjp(self._rows(obs, state), truncation)
+        rows = self._rows(obs, state)
+        if (later := self.network.deferred(rows, self._learned, (*obs.shape[:3], self.num_values))) is not None:
+            return later
+        outputs, vjp = self.network.unroll_with_vjp(rows, truncation)
         return WithVJP(self._values(outputs), lambda slope: vjp(slope.view(outputs.shape)), self._learned)
 
     @cached_property

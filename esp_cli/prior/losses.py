@@ -7,6 +7,8 @@ their slopes (`policy_gap`, `value_gap`); a foreign training loop gives them to 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
+from math import prod
 from typing import Any, NamedTuple
 
 import torch
@@ -114,27 +116,41 @@ class Loss:
 
 
 class Values:
-    """What a critic outputs for originals and copies; a slope is by `rows`.
+    """What a critic outputs for originals and copies.
+
+    A slope is by `rows`, or what a kernel is asked to compute together with them, where it `defers`.
 
     Attributes:
         count: C.
-        rows: [S, 1 + K, B T C] in the frame.
+        sizes: S, P and R = B T C.
+        defers: whether the values are not computed yet, and need not be.
     """
 
     def __init__(self, values: Any, frame: Frame) -> None:
         self._values, self._frame = values, frame
-        pulled = frame.pull_values(values.tensor)
-        self._shape, self.count, self.rows = pulled.shape, pulled.shape[-1], pulled.flatten(2)
+        num_seeds, *rows, self.count = values.size
+        self.defers = values.waits and values.parameters[-1].numel() == num_seeds and not frame.moves_agents
+        self.sizes = (num_seeds, frame.parts, prod(rows) * self.count // frame.parts)
 
-    def back(self, slope: Tensor) -> list[tuple[Tensor, Tensor]]:
-        return [(self._values, self._frame.push_values(slope.view(self._shape)))]
+    @cached_property
+    def rows(self) -> Tensor:
+        """[S, P, R] in the frame."""
+        return self._frame.pull_values(self._values.tensor).flatten(2)
+
+    def back(self, slope: Any) -> list[tuple[Any, Any]]:
+        if not isinstance(slope, Tensor):
+            return [(self._values.learn(slope.learn, self.sizes[1]), slope)]
+        rows = (self._values.size[1] // self.sizes[1], *self._values.size[2:])
+        return [(self._values, self._frame.push_values(slope.unflatten(2, rows)))]
 
 
 class OfGraph:
     """What a network returned under autograd: `graph`, and `tensor` without the graph."""
 
+    waits = False
+
     def __init__(self, graph: Tensor) -> None:
-        self.tensor, self.graph = graph.detach(), graph
+        self.tensor, self.graph, self.size = graph.detach(), graph, graph.shape
 
     def back(self, slope: Tensor) -> list[tuple[OfGraph, Tensor]]:
         return [(self, slope)]
@@ -203,14 +219,20 @@ def value_gap(mask: Tensor | None, stop_gradient: str) -> Equation:
     """Return the mean of S_V (S_Q) over copies and rows that count, as an equation on `Values`."""
 
     def equation(values: Values, weight: float, slope: Tensor | None) -> Stated:
+        num_seeds, num_parts, num_rows = values.sizes
+        share = shares(mask, (num_seeds, num_parts - 1, num_rows))
+
+        def stated() -> Tensor:
+            return value_consistency_loss(values.rows[:, 1:], values.rows[:, :1])
+
+        if not (slope is None or isinstance(slope, Tensor)):
+            return Stated(stated, share, slope.with_gap(weight * share, stop_gradient))
         slope = torch.zeros_like(values.rows) if slope is None else slope
-        here, copies = values.rows[:, :1], values.rows[:, 1:]
-        share, by_copies = shares(mask, copies.shape), copies - here
-        by_copies.mul_(2 * weight * share)
+        by_copies = (values.rows[:, 1:] - values.rows[:, :1]).mul_(2 * weight * share)
         if stop_gradient != "transformed":
             slope[:, 1:].add_(by_copies)
         if stop_gradient != "original":
             slope[:, :1].sub_(by_copies if by_copies.shape[1] == 1 else by_copies.sum(1, keepdim=True))
-        return Stated(lambda: value_consistency_loss(copies, here), share, slope)
+        return Stated(stated, share, slope)
 
     return equation

@@ -18,11 +18,16 @@ class Frame:
 
     Args:
         transforms: K, with which copies were made that follow the B originals along the batch axis.
+
+    Attributes:
+        parts: 1 + K.
+        moves_agents: whether any exchanges agents.
     """
 
     def __init__(self, transforms: Sequence[Transform]) -> None:
         self._transforms = list(transforms)
-        self._moves_agents = any(g.agents is not None for g in self._transforms)
+        self.parts = 1 + len(self._transforms)
+        self.moves_agents = any(g.agents is not None for g in self._transforms)
 
     def pull_outputs(self, outputs: Tensor) -> Tensor:
         """Return a policy's outputs [S, (1 + K) B, ..., N, A] in the frame: [S, 1 + K, B, ..., N, A]."""
@@ -57,14 +62,14 @@ class Frame:
     def pull_values(self, values: Tensor) -> Tensor:
         """Return values [S, (1 + K) B, ..., C] in the frame: [S, 1 + K, B, ..., C]."""
         parts = self._parts(values)
-        return self._each(parts, lambda g: g.values) if self._moves_agents else parts
+        return self._each(parts, lambda g: g.values) if self.moves_agents else parts
 
     def push_values(self, values: Tensor) -> Tensor:
         """Undo `pull_values`, likewise."""
-        return (self._each(values, lambda g: g.per_agent) if self._moves_agents else values).flatten(1, 2)
+        return (self._each(values, lambda g: g.per_agent) if self.moves_agents else values).flatten(1, 2)
 
     def _parts(self, x: Tensor) -> Tensor:
-        return x.unflatten(1, (1 + len(self._transforms), -1))
+        return x.unflatten(1, (self.parts, -1))
 
     def _each(self, parts: Tensor, move: Callable[[Transform], Callable[[Tensor], Tensor]]) -> Tensor:
         here, *copies = parts.unbind(1)

@@ -13,6 +13,7 @@ from torch.distributions import Normal, kl_divergence
 from esp_cli.algorithms import maddpg, mappo, off_policy, qmix
 from esp_cli.algorithms.adam import SeedParameters
 from esp_cli.algorithms.objectives import clipped_surrogate, ppo_loss, value_error, value_loss
+from esp_cli.networks.contract import WithVJP
 from esp_cli.networks.heads import Categorical
 from esp_cli.networks.plain import MlpConfig
 from esp_cli.networks.policy import StochasticPolicy
@@ -167,13 +168,14 @@ def test_each_term_moves_the_gradient(change, actions):
     assert max(map(gap, ours, theirs)) > 3e-3
 
 
-class Alone:
+class Alone(WithVJP):
     """What a network returned, of which nothing is learned further."""
 
     def __init__(self, tensor):
-        self.tensor, self.parameters, self.slope = tensor, [], None
+        super().__init__(tensor, self._take, [])
+        self.slope = None
 
-    def vjp(self, slope):
+    def _take(self, slope):
         self.slope = slope
         return []
 

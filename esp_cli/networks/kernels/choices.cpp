@@ -2,14 +2,14 @@
 //
 // Parts are the originals and copies of them. Data are [S, R] or [S, L, R] of the L parts that are learned from.
 
-#include "vectors.h"
+#include "perceptron.h"
 
 namespace {
 
 // What choices.py fills in.
 struct Choices {
     int64_t seeds, parts, rows, actions, threads;
-    int64_t by_seed, by_row, by_action;  // steps between the outputs [S, P R, A]
+    int64_t by_seed, by_part, by_row, by_action;  // steps between the outputs [S, P, R, A]
     const int64_t *orders;               // [S, P, A]: which output of a part is the original's action
     const float *outputs;
     float *log_prob, *prob;  // [S, A, P, R]
@@ -31,7 +31,7 @@ struct Batch {
     int64_t seed, begin, count;  // count <= LANES
 
     int64_t output(int64_t part, int64_t lane, int64_t a) const {
-        return seed * of.by_seed + (part * of.rows + begin + lane) * of.by_row +
+        return seed * of.by_seed + part * of.by_part + (begin + lane) * of.by_row +
                of.orders[(seed * of.parts + part) * of.actions + a] * of.by_action;
     }
     int64_t number(int64_t part, int64_t a) const {
@@ -95,7 +95,7 @@ Vec clipped(const Batch &batch, const Slope &slope, int64_t part, Vec log_prob) 
 }
 
 // Write the slope by the outputs of a part.
-void back(const Batch &batch, const Slope &slope, int64_t part, const Vec *known, Vec *by, float *by_outputs) {
+void back_part(const Batch &batch, const Slope &slope, int64_t part, const Vec *known, Vec *by, float *by_outputs) {
     const Choices &of = batch.of;
     const bool learned = slope.action && part < slope.learned;
     const int64_t row = batch.row(0, 1), step = 2 * of.actions;
@@ -125,6 +125,14 @@ void back(const Batch &batch, const Slope &slope, int64_t part, const Vec *known
     }
 }
 
+// Write the slope by the outputs of all parts, with room for two numbers of each action of one part more.
+void back(const Batch &batch, const Slope &slope, Vec *room, float *by_outputs) {
+    const int64_t step = 2 * batch.of.actions;
+    for (int64_t k = 0; k < batch.of.parts; k++) softmax(batch, k, room + k * step);
+    for (int64_t k = 0; k < batch.of.parts; k++)
+        back_part(batch, slope, k, room, room + batch.of.parts * step, by_outputs);
+}
+
 }  // namespace
 
 extern "C" {
@@ -140,10 +148,20 @@ void choose(const Choices *choices) {
 }
 
 void choose_backward(const Choices *choices, const Slope *slope, float *by_outputs) {
-    const int64_t step = 2 * choices->actions;
-    each_batch(*choices, (choices->parts + 1) * step, [=](const Batch &batch, Vec *room) {
-        for (int64_t k = 0; k < batch.of.parts; k++) softmax(batch, k, room + k * step);
-        for (int64_t k = 0; k < batch.of.parts; k++) back(batch, *slope, k, room, room + batch.of.parts * step, by_outputs);
+    each_batch(*choices, 2 * (choices->parts + 1) * choices->actions,
+               [=](const Batch &batch, Vec *room) { back(batch, *slope, room, by_outputs); });
+}
+
+// Compute the gradients by the parameters of a perceptron whose outputs are the choices; rows are [R, P].
+void learn_choices(const Perceptron *given, const Choices *choices, const Slope *slope, float *by_parameters) {
+    learn_from(Layout(*given), by_parameters, [&](int64_t seed, Span span, int64_t width, float *outputs) {
+        Choices here = *choices;
+        here.by_seed = 0, here.by_part = width, here.by_row = here.parts * width, here.by_action = 1;
+        Span left{span.begin / here.parts, span.end / here.parts};
+        here.outputs = outputs -= left.begin * here.by_row;
+        Scratch room = scratch(2 * (here.parts + 1) * here.actions * LANES);
+        for (; left.size() > 0; left.begin += LANES)
+            back(Batch{here, seed, left.begin, std::min<int64_t>(LANES, left.size())}, *slope, &vec(room.get()), outputs);
     });
 }
 

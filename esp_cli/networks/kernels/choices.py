@@ -10,11 +10,13 @@ import torch
 from torch import Tensor
 
 from esp_cli.networks.kernels.library import call, fields
+from esp_cli.networks.kernels.perceptron import LearningPass
 
 
 class _Choices(ctypes.Structure):
     _fields_ = (
-        *fields(ctypes.c_int64, "seeds", "parts", "rows", "actions", "threads", "by_seed", "by_row", "by_action"),
+        *fields(ctypes.c_int64, "seeds", "parts", "rows", "actions", "threads"),
+        *fields(ctypes.c_int64, "by_seed", "by_part", "by_row", "by_action"),
         *fields(ctypes.c_void_p, "orders", "outputs", "log_prob", "prob", "entropy", "gap"),
     )
 
@@ -57,6 +59,42 @@ class Slope(NamedTuple):
     clipped: Clipped | None = None  # instead of `chosen`
     gaps: tuple[Tensor | float, str] | None = None  # weights, a number or [S, 1, R], and which side is held fixed
 
+    def asked(self) -> _Slope:
+        """Return what the kernel is asked for; it keeps the tensors that it points at."""
+        asked, kept = _Slope(), list[Tensor]()
+
+        def data(x: Tensor) -> int:
+            kept.append(x.contiguous())
+            return kept[-1].data_ptr()
+
+        def weight(x: Tensor | float) -> tuple[float, int | None]:
+            return (0.0, data(x)) if isinstance(x, Tensor) else (x, None)
+
+        if self.chosen is not None:
+            action, by_log_prob, by_entropy = self.chosen
+            asked.learned, asked.action, asked.by_log_prob = by_log_prob.shape[1], data(action), data(by_log_prob)
+            asked.entropy_weight, asked.entropy_weights = weight(by_entropy)
+        if (clipped := self.clipped) is not None:
+            asked.learned, asked.action, asked.clip = clipped.learned, data(clipped.action), clipped.epsilon
+            asked.old_parts, asked.old = clipped.old_log_prob.shape[1], data(clipped.old_log_prob)
+            asked.advantage = data(clipped.advantage)
+            asked.clip_weight, asked.clip_weights = weight(clipped.weight)
+            asked.entropy_weight, asked.entropy_weights = weight(clipped.entropy_weight)
+        if self.gaps is not None:
+            weights, fixed = self.gaps
+            asked.gap_weight, asked.gap_weights = weight(weights)
+            asked.moves_copies, asked.moves_originals = fixed != "transformed", fixed != "original"
+        asked.kept = kept
+        return asked
+
+    def learn(self, run: LearningPass, orders: Tensor) -> Tensor:
+        """Return the gradients [S, P] by the parameters of a perceptron whose outputs are choices; see there."""
+        orders = orders.contiguous()
+        (num_seeds, num_parts, num_actions), num_rows = orders.shape, run.num_rows
+        sizes = (num_seeds, num_parts, num_rows, num_actions)
+        choices = _Choices(*sizes, orders=orders.data_ptr())
+        return run.learn("choices", "learn_choices", choices, self.asked())
+
 
 class CompiledChoices:
     """Softmax of outputs [S, P R, A] of P parts, each reordered to the originals' actions.
@@ -73,7 +111,9 @@ class CompiledChoices:
 
     def _arguments(self, *numbers: Tensor) -> _Choices:
         kept = (self._orders, self._outputs, *numbers)
-        return _Choices(*self._sizes, *self._outputs.stride(), *(x.data_ptr() for x in kept))
+        by_seed, by_row, by_action = self._outputs.stride()
+        steps = (by_seed, by_row * self._sizes[2], by_row, by_action)
+        return _Choices(*self._sizes, *steps, *(x.data_ptr() for x in kept))
 
     @cached_property
     def numbers(self) -> Numbers:
@@ -89,28 +129,6 @@ class CompiledChoices:
         by_outputs = torch.empty_like(self._outputs)
         if by_outputs.stride() != self._outputs.stride():
             by_outputs = torch.empty_strided(self._outputs.shape, self._outputs.stride())
-        asked, kept = _Slope(), list[Tensor]()
-
-        def data(x: Tensor) -> int:
-            kept.append(x.contiguous())
-            return kept[-1].data_ptr()
-
-        def weight(x: Tensor | float) -> tuple[float, int | None]:
-            return (0.0, data(x)) if isinstance(x, Tensor) else (x, None)
-
-        if slope.chosen is not None:
-            action, by_log_prob, by_entropy = slope.chosen
-            asked.learned, asked.action, asked.by_log_prob = by_log_prob.shape[1], data(action), data(by_log_prob)
-            asked.entropy_weight, asked.entropy_weights = weight(by_entropy)
-        if (clipped := slope.clipped) is not None:
-            asked.learned, asked.action, asked.clip = clipped.learned, data(clipped.action), clipped.epsilon
-            asked.old_parts, asked.old = clipped.old_log_prob.shape[1], data(clipped.old_log_prob)
-            asked.advantage = data(clipped.advantage)
-            asked.clip_weight, asked.clip_weights = weight(clipped.weight)
-            asked.entropy_weight, asked.entropy_weights = weight(clipped.entropy_weight)
-        if slope.gaps is not None:
-            weights, fixed = slope.gaps
-            asked.gap_weight, asked.gap_weights = weight(weights)
-            asked.moves_copies, asked.moves_originals = fixed != "transformed", fixed != "original"
+        asked = slope.asked()
         call("choices", "choose_backward", self._arguments(), asked, by_outputs)
         return by_outputs

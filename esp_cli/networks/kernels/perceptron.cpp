@@ -1,6 +1,14 @@
-// The passes of perceptron.py.
+// The passes of perceptron.py, and the loss of values.py.
 
 #include "perceptron.h"
+
+// What values.py fills in: Huber losses of the first parts of rows [R, P], and squared gaps between each copy and the
+// original.
+struct Regression {
+    int64_t learned, moves_copies, moves_originals;
+    float delta, weight, gap_weight;
+    const float *target;  // [S, R]
+};
 
 extern "C" {
 
@@ -23,6 +31,26 @@ void backward(const Perceptron *given, const Rows *by_outputs, float *by_paramet
         copy(span.size(), last, {from, by_outputs->row, by_outputs->column}, to, padded(last), 1);
     };
     pull(net, by_parameters, *below, [](int64_t) {}, fill);
+}
+
+// Compute the gradients by the parameters of a perceptron with one output.
+void learn_values(const Perceptron *given, const Regression *of, float *by_parameters) {
+    const Layout net(*given);
+    const int64_t parts = net.things;
+    learn_from(net, by_parameters, [&](int64_t seed, Span span, int64_t width, float *outputs) {
+        const float *target = of->target + (seed * net.rows + span.begin) / parts;
+        for (int64_t r = 0; r < span.size() / parts; r++, outputs += parts * width) {
+            const float original = outputs[0];
+            float gaps = 0;
+            for (int64_t k = 0; k < parts; k++) {
+                float value = outputs[k * width], gap = of->gap_weight * 2 * (value - original);
+                float error = std::clamp(value - target[r], -of->delta, of->delta);
+                outputs[k * width] = (k < of->learned ? of->weight * error : 0) + (of->moves_copies ? gap : 0);
+                gaps += gap;
+            }
+            if (of->moves_originals) outputs[0] -= gaps;
+        }
+    });
 }
 
 }

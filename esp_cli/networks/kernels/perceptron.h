@@ -292,4 +292,17 @@ void pull(const Layout &net, float *by_parameters, const Below &below, Prepare p
         });
 }
 
+// Compute the gradients by the parameters of a loss whose rows stay together: change(seed, rows, width, outputs) turns
+// a block of outputs, [rows, width], into the slopes by them in place; numbers behind the outputs are 0 and stay so.
+template <class Change>
+void learn_from(const Layout &net, float *by_parameters, Change change) {
+    const int64_t width = padded(net.out(net.layers - 1));
+    auto fill = [&](const Layout &, int64_t seed, Span span, float *own) {
+        const float *other = own + net.block * net.widest;
+        if (net.layers % 2 == 0) std::copy(other, other + span.size() * width, own);
+        change(seed, span, width, own);
+    };
+    pull(net, by_parameters, Below{}, [](int64_t) {}, fill);
+}
+
 }  // namespace

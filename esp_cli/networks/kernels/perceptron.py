@@ -209,3 +209,28 @@ class CompiledPass:
             None if part is None or not wanted else part.unflatten(1, size)
             for wanted, part, size in zip(learns, parts, shapes, strict=True)
         ]
+
+
+class LearningPass(CompiledPass):
+    """A pass whose outputs a kernel turns into the slope of a loss at once, block by block; they are kept nowhere.
+
+    Args:
+        rows: [S, R, parts, in], the parts of a row stay together.
+        parameters: of a perceptron that does not end with an activation.
+        activation: of its hidden layers.
+    """
+
+    computes_again = True
+
+    def __init__(self, rows: Tensor, parameters: Sequence[Tensor], activation: str) -> None:
+        self.num_rows = rows.shape[1]
+        super().__init__([rows], parameters, activation, False, keep=False, things=rows.shape[2])
+
+    def _passed(self, like: Tensor, columns_first: bool) -> Tensor:
+        return like
+
+    def learn(self, kernel: str, function: str, *of_loss: ctypes.Structure) -> Tensor:
+        """Return the gradients [S, P] by all parameters of a loss that a kernel knows."""
+        found = self._room(self.outputs)
+        call(kernel, function, self._arguments, *of_loss, found)
+        return found
