@@ -64,7 +64,7 @@ class Deferred(WithVJP):
     """What a compiled perceptron returns for rows, computed where somebody asks for it; see `learn`."""
 
     def __init__(self, shape: Shape, rows: Tensor, parameters: Sequence[Tensor], size: Sequence[int]) -> None:
-        self._shape, self._rows, self.parameters, self.size = shape, rows, parameters, size
+        self._shape, self._rows, self.parameters, self.size = shape, rows, parameters, torch.Size(size)
 
     @cached_property
     def _run(self) -> CompiledPass:
@@ -78,7 +78,7 @@ class Deferred(WithVJP):
     def tensor(self) -> Tensor:  # type: ignore[override]
         return self._run.outputs.unflatten(1, self._rows.shape[1:-1]).reshape(self.size)
 
-    def vjp(self, slope: Tensor) -> list[Tensor]:  # type: ignore[override]
+    def vjp(self, slope: Tensor) -> list[Tensor]:
         return self._run.backward(slope.reshape(self._run.outputs.shape))
 
     def learn(self, loss: Callable[[LearningPass], Tensor], parts: int) -> WithVJP:

@@ -137,9 +137,7 @@ class Copies(Generic[Rows]):
             gap = policy_consistency_loss(head.divergence, outputs[:, 1:], outputs[:, :1], stop).flatten(2)
             gaps["policy"] = Loss.of(average(gap, shares(rows.mask, gap.shape)))
         if value is not None:
-            gaps["value"] = Loss(
-                Term(self.values(value), 1.0, value_gap(rows.valued(_returned(value).tensor.shape[-1]), stop))
-            )
+            gaps["value"] = Loss(Term(self.values(value), 1.0, value_gap(rows.valued(_returned(value).size[-1]), stop)))
         return gaps
 
 

@@ -110,7 +110,7 @@ class _Plan:
             (ctypes.c_void_p * len(lies))(*(at for at, _ in parameters)),
             (ctypes.c_int64 * len(lies))(*(steps[0] for _, steps, _ in lies)),
         )
-        widths, at, strides = map(ctypes.addressof, self._tables)
+        widths, at, strides = (ctypes.addressof(table) for table in self._tables)
         seeds, rows = self.size
         self.arguments = _Perceptron(
             seeds=seeds, rows=rows, layers=len(self.widths) - 1, activate_output=activate_output, parts=len(columns),
