@@ -44,11 +44,7 @@ def gae(
     """
     delta = torch.where(terminated, reward, reward + gamma * next_value) - value
     decay = gamma * gae_lambda * (~ended).to(delta.dtype)
-    advantage, carry = torch.empty_like(delta), torch.zeros_like(delta[:, :, 0])
-    for t in reversed(range(delta.shape[2])):
-        carry = delta[:, :, t] + decay[:, :, t] * carry
-        advantage[:, :, t] = carry
-    return advantage
+    return _recursion(delta, decay)
 
 
 def td_targets(
@@ -74,9 +70,16 @@ def td_targets(
     target = reward + ahead
     if cut is not None:
         step, decay = torch.where(cut, target, step), decay.masked_fill(cut, 0)
-    for t in reversed(range(reward.shape[2] - 1)):
-        target[:, :, t] = step[:, :, t] + decay[:, :, t] * target[:, :, t + 1]
-    return target
+    return _recursion(torch.cat([step[:, :, :-1], target[:, :, -1:]], 2), decay)
+
+
+def _recursion(x: Tensor, decay: Tensor) -> Tensor:
+    """Return y [S, B, T, C] with y_t = x_t + decay_t y_{t+1} and, at the end, y_T = x_T."""
+    steps, decays = x.unbind(2), decay.expand_as(x).unbind(2)
+    y = [steps[-1]]
+    for t in reversed(range(len(steps) - 1)):
+        y.append(steps[t] + decays[t] * y[-1])
+    return torch.stack(y[::-1], 2)
 
 
 def normalise_per_seed(x: Tensor, epsilon: float = 1e-5, valid: Tensor | None = None) -> Tensor:

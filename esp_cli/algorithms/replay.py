@@ -35,11 +35,11 @@ class EpisodeBatch(SeedBatch):
     valid: Tensor
 
     @property
-    def mask(self) -> Tensor:
+    def mask(self) -> Tensor | None:
         return self.valid if self.alive is None else self.valid.unsqueeze(-1) & self.alive[:, :, :-1]
 
     @property
-    def played(self) -> Tensor:
+    def played(self) -> Tensor | None:
         return self.valid
 
     def of_living(self, x: Tensor, after: bool = False) -> Tensor:
@@ -48,6 +48,12 @@ class EpisodeBatch(SeedBatch):
             return x
         alive = self.alive[:, :, 1:] if after else self.alive[:, :, :-1]
         return x.masked_fill(~alive if x.dim() == alive.dim() else ~alive.unsqueeze(-1), 0)
+
+
+class WholeEpisodes(EpisodeBatch):
+    """Episodes of agents and worlds that all last to the horizon, so that every row counts."""
+
+    mask = played = None
 
 
 class EpisodeReplay:
@@ -66,7 +72,8 @@ class EpisodeReplay:
             allowed = room(steps + 1, agents, space.count, dtype=torch.bool) if spec.masks else None
         else:
             action = room(steps, agents, space.width)
-        self._store = EpisodeBatch(
+        kind = EpisodeBatch if spec.terminates or spec.agents_end else WholeEpisodes
+        self._store = kind(
             obs=room(steps + 1, agents, spec.observation.width),
             state=room(steps + 1, spec.state.width),
             action=action,
