@@ -136,12 +136,14 @@ class Maddpg(ExploringLearner):
         noise = copies.tiled(noise.to(self.device, non_blocking=True))
         outputs = self._outputs(copies.rows)
         chosen = copies.for_loss(outputs)
-        self.critic.requires_grad_(False)
+        for p in self.critic_optimiser.parameters.parameters:  # a module looks for them each time
+            p.requires_grad_(False)
         value = self._value_of_policy(copies.for_loss(here), chosen, noise, batch)
         policy_loss = -self._value_scale * mean_per_seed(value, batch.mask)
         loss = policy_loss + self.config.output_penalty * mean_per_seed(self.head.penalty(chosen), batch.mask)
         (norm,) = self.actor_optimiser.step(loss + copies.penalty(policy=(self.head, outputs)))
-        self.critic.requires_grad_(True)
+        for p in self.critic_optimiser.parameters.parameters:
+            p.requires_grad_(True)
         metrics = {name: mean_per_seed(x, batch.mask) for name, x in self.head.statistics(chosen.detach()).items()}
         return metrics | {"policy_loss": policy_loss, "actor_grad_norm": norm}
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from esp_cli.algorithms.adam import SeedAdam
 from esp_cli.algorithms.learner import Iteration, Learner, LearnerConfig, below
 from esp_cli.algorithms.normalisation import ValueNormaliser
-from esp_cli.algorithms.objectives import td_targets, value_loss
+from esp_cli.algorithms.objectives import td_targets, value_error
 from esp_cli.algorithms.replay import EpisodeBatch, EpisodeCollector, EpisodeReplay
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.exploration import ExploringHead
@@ -186,8 +186,8 @@ class OffPolicyLearner(Learner):
     @torch.no_grad()
     def td_metrics(self, values: Tensor, target: Tensor, batch: EpisodeBatch) -> dict[str, Tensor]:
         """Return what is logged of a step: L_TD and the mean value, over the originals; [S, B, T, C] each."""
-        loss = value_loss(values, target, self.prior.alone(batch), self.config.huber_delta)
-        return {"td_loss": loss.value, "value": mean_per_seed(values, batch.valued(values.shape[-1]))}
+        (error, _), valued = value_error(values, target, self.config.huber_delta), batch.valued(values.shape[-1])
+        return {"td_loss": mean_per_seed(error, valued), "value": mean_per_seed(values, valued)}
 
     def adam(self, module: nn.Module, *others: nn.Module, learning_rate: float) -> SeedAdam:
         """Return an optimiser of the parameters of some networks, whose gradients are clipped together."""

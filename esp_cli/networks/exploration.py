@@ -90,7 +90,8 @@ class ExploringCategorical(ExploringChoice, Categorical):
     def penalty(self, log_probs: Tensor) -> Tensor:
         """Return the mean square of the centred logits, which keeps a policy from getting too sure: [S, B, N]."""
         if not self.masks:
-            return (log_probs - log_probs.mean(-1, keepdim=True)).square().mean(-1)
+            columns = log_probs.movedim(-1, 1)  # as they lie in memory, so that their gradient lies alike
+            return (columns - columns.mean(1, keepdim=True)).square().mean(1)
         allowed = log_probs > MASKED / 2
         count = allowed.sum(-1, keepdim=True)
         known = torch.where(allowed, log_probs, 0.0)
