@@ -24,6 +24,7 @@ SEEN = 3.0
 _STATES, _LYING, _PLANTED = 48, 24, 12
 """States that are compared, those that are laid on the floor, and those for each planted mistake."""
 _NO_CONSTRAINTS, _NO_CONTACTS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT), int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+_NO_LIMITS = int(mujoco.mjtDisableBit.mjDSBL_LIMIT | mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS) | _NO_CONTACTS
 Sample = tuple[Floats, Floats, Floats, Floats]
 """qpos, qvel, ctrl and forces on the degrees of freedom."""
 
@@ -33,7 +34,8 @@ class Proof:
     """What the simulator says of a match. A gap is a share: 0 is a perfect mirror, 1 no mirror at all.
 
     Attributes:
-        joints: [joints] the root mean square gap of the accelerations of each joint over theirs, without constraints.
+        joints: [joints] the root mean square gap of the accelerations of each joint over theirs, without constraints;
+            of a model with equalities, as of closed loops and mimic joints, the larger of those with and without them.
         planted: [joints] the smallest gap of mistakes planted at each.
         median: of the states' gaps: |difference| / |accelerations|.
         constraints: the same median with limits, friction and equalities.
@@ -91,6 +93,9 @@ def prove(frame: Frame, match: Match, seed: int = 0) -> Proof:
         return _gaps(frame, tried, here[:count], there)
 
     joints, median = compared(match, _STATES)
+    if frame.model.neq:
+        joined, tied = (_accelerations(frame, data, s, _NO_LIMITS) for s in (samples, _images(match, samples)))
+        joints = np.maximum(joints, _gaps(frame, match, joined, tied)[0])
     planted = [
         min(compared(wrong, _PLANTED)[0].max() for wrong in _mistakes(frame, match, joint))
         for joint in range(frame.model.njnt)
