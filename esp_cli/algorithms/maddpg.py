@@ -103,7 +103,7 @@ class Maddpg(ExploringLearner):
         """Take one gradient step of the critic, then one of the actor, then move the targets."""
         copies = self.prior.copies(batch, self.generators["prior"])
         seen = self.critic_rows(copies.rows)
-        here = seen[:, :, :-1].contiguous()
+        here = seen[:, :, :-1]
         metrics = self._learn_critic(copies, seen, here) | self._learn_actor(copies, here)
         for target, online in self._targets_of:
             target.buffer.lerp_(online.buffer, self.config.tau)

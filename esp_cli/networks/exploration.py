@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 from torch.autograd import Function
+from torch.nn.functional import mse_loss
 
 from esp_cli.networks.heads import MASKED, Categorical, Choice, Head, best, drawn, same_disc, squash
 from esp_envs.base import random_choice
@@ -91,7 +92,8 @@ class ExploringCategorical(ExploringChoice, Categorical):
         """Return the mean square of the centred logits, which keeps a policy from getting too sure: [S, B, N]."""
         if not self.masks:
             columns = log_probs.movedim(-1, 1)  # as they lie in memory, so that their gradient lies alike
-            return (columns - columns.mean(1, keepdim=True)).square().mean(1)
+            middle = columns.detach().mean(1, keepdim=True)  # the gradient by which is 0
+            return mse_loss(columns, middle.expand_as(columns), reduction="none").mean(1)
         allowed = log_probs > MASKED / 2
         count = allowed.sum(-1, keepdim=True)
         known = torch.where(allowed, log_probs, 0.0)
