@@ -15,6 +15,7 @@ import numpy as np
 
 from esp_cli.bodies.deriving import Match
 from esp_cli.bodies.frame import BALL, FREE, Frame
+from esp_cli.bodies.reading import printable
 from esp_cli.symmetry.elements import Floats
 
 EXACT, NEARLY = 1e-5, 0.05
@@ -40,6 +41,9 @@ class Proof:
         median: of the states' gaps: |difference| / |accelerations|.
         constraints: the same median with limits, friction and equalities.
         contacts: the same median where the robot lies on a floor; None where it cannot move freely, or touches none.
+        sensors: the largest gap of a sensor's readings, mirrored, from those of the sensor of its kind that fits best,
+            without constraints; None where none shows anything then. Attitudes are left out; the verdict leaves it out.
+        sensor: the name of that sensor.
     """
 
     joints: Floats
@@ -47,6 +51,8 @@ class Proof:
     median: float
     constraints: float
     contacts: float | None
+    sensors: float | None
+    sensor: str
 
     @property
     def gap(self) -> float:
@@ -62,7 +68,8 @@ class Proof:
     @property
     def summary(self) -> dict[str, Any]:
         """The verdict and all gaps, as JSON takes them."""
-        gaps = {"gap": self.gap, "median": self.median, "constraints": self.constraints, "contacts": self.contacts}
+        names = ("gap", "median", "constraints", "contacts", "sensors")
+        gaps = {name: getattr(self, name) for name in names}
         return {"verdict": self.verdict, **gaps, "smallest_planted": float(self.planted.min())}
 
     def would_show(self, planted: float) -> bool:
@@ -71,6 +78,7 @@ class Proof:
 
     def __str__(self) -> str:
         contact = "" if self.contacts is None else f", in contact to {self.contacts:.2g}"
+        contact += "" if self.sensors is None else f", sensors to {self.sensors:.2g} ({self.sensor})"
         return (
             f"accelerations agree to {self.gap:.2g} at the worst joint, {self.median:.2g} in the median, with limits "
             f"and friction to {self.constraints:.2g}{contact}; the least planted mistake is off by "
@@ -102,17 +110,15 @@ def prove(frame: Frame, match: Match, seed: int = 0) -> Proof:
     ]
     lowered = [_lowered(frame, data, sample) for sample in samples[:_LYING]]
     lying = [sample for sample in lowered if sample is not None]
-    medians = [
-        _gaps(
-            frame,
-            match,
-            _accelerations(frame, data, some, flag),
-            _accelerations(frame, data, _images(match, some), flag),
-        )[1]
+    pairs = [
+        [_accelerations(frame, data, states, flag) for states in (some, _images(match, some))]
         for some, flag in ((samples, _NO_CONTACTS), (lying, 0))
         if some
     ]
-    return Proof(joints, np.array(planted), median, medians[0], medians[1] if lying else None)
+    medians = [_gaps(frame, match, *pair)[1] for pair in pairs]
+    shown = _sensors(frame.model, here, _accelerations(frame, data, _images(match, samples), _NO_CONSTRAINTS))
+    sensors, sensor = max(shown, default=(None, ""))
+    return Proof(joints, np.array(planted), median, medians[0], medians[1] if lying else None, sensors, sensor)
 
 
 def _state(frame: Frame, data: Any, rng: np.random.Generator) -> Sample:
@@ -148,7 +154,7 @@ def _images(match: Match, samples: Sequence[Sample]) -> list[Sample]:
 
 
 def _accelerations(frame: Frame, data: Any, samples: Sequence[Sample], disabled: int) -> Floats:
-    """Return qacc [states, nv] without what the flags disable."""
+    """Return qacc and readings of sensors [states, nv + numbers of sensors] without what the flags disable."""
     before = frame.model.opt.disableflags
     frame.model.opt.disableflags = before | disabled
     found = []
@@ -158,20 +164,40 @@ def _accelerations(frame: Frame, data: Any, samples: Sequence[Sample], disabled:
             data.qpos[:], data.qvel[:], data.ctrl[:], data.qfrc_applied[:] = sample
             data.qacc_warmstart[:] = 0
             mujoco.mj_forward(frame.model, data)
-            found.append(data.qacc.copy())
+            found.append(np.r_[data.qacc, data.sensordata])
     finally:
         frame.model.opt.disableflags = before
     return np.stack(found)
 
 
 def _gaps(frame: Frame, match: Match, here: Floats, there: Floats) -> tuple[Floats, float]:
-    """Return the gap of each joint, and the median of the states' gaps, of accelerations [states, nv]."""
+    """Return the gap of each joint, and the median of the states' gaps, of what `_accelerations` returns."""
+    here, there = here[:, : frame.model.nv], there[:, : frame.model.nv]
     wanted = here @ match.qvel.T
     wrong, size = np.square(wanted - there), np.square(wanted)
     least = max(1e-12 * size.mean(), 1e-24)
     spans = [frame.dofs_of(j) for j in range(frame.model.njnt)]
     joints = np.array([np.sqrt(wrong[:, span].mean() / max(size[:, span].mean(), least)) for span in spans])
     return joints, float(np.median(np.sqrt(wrong.sum(1) / np.maximum(size.sum(1), 1e-24))))
+
+
+def _sensors(model: Any, here: Floats, there: Floats) -> list[tuple[float, str]]:
+    """Return the gap and name of each sensor that shows something; see `Proof`."""
+    seen: dict[tuple[int, int], list[tuple[Floats, Floats, str]]] = {}
+    for s, (kind, width) in enumerate(zip(model.sensor_type.tolist(), model.sensor_dim.tolist(), strict=True)):
+        start = model.nv + model.sensor_adr[s]
+        if width in (1, 3):  # readings are compared up to where their zero is
+            own, other = (x[:, start : start + width] - x[:, start : start + width].mean(0) for x in (here, there))
+            seen.setdefault((kind, width), []).append((own, other, printable(model.sensor(s).name or f"sensor {s}")))
+    found = []
+    for like in seen.values():
+        for own, _, name in like:
+            size, gaps = np.linalg.norm(own), []
+            for _, other, _ in like if size > 1e-9 else []:
+                u, _, v = np.linalg.svd(own.T @ other)
+                gaps.append(np.linalg.norm(own @ (u @ v) - other) / size)
+            found += [(float(min(gaps)), name)] if gaps else []
+    return found
 
 
 def _mistakes(frame: Frame, match: Match, joint: int) -> Iterator[Match]:

@@ -212,3 +212,19 @@ def test_a_search_ends_in_time_and_says_what_it_did_not_reach() -> None:
     body = Body.from_mjcf(mujoco.MjModel.from_xml_string(biped()), seconds=0)
     assert not body.found
     assert set(body.refused.values()) == {"not covered: the 0 s for the search were over"}
+
+
+@pytest.mark.parametrize(("feet", "worst"), [(("left", "right"), 1e-9), (("left",), None)])
+def test_sensors_are_proven_too(feet, worst):
+    told = "".join(f'<jointpos joint="{foot}_knee"/><actuatorfrc actuator="a_{foot}_knee"/>' for foot in feet)
+    text = biped().replace(
+        "</mujoco>", f'<sensor>{told}<subtreecom body="chest"/><subtreelinvel body="chest"/></sensor></mujoco>'
+    )
+    proof = Body.from_mjcf(mujoco.MjModel.from_xml_string(text)).found["flip-x"].proof
+    if worst is None:
+        assert proof.sensors > 0.5
+        assert proof.sensor in ("sensor 0", "sensor 1"), "a knee has a sensor, its image none"
+    else:
+        assert proof.sensors < worst
+        assert "sensors to" in str(proof)
+    assert Body.from_mjcf(mujoco.MjModel.from_xml_string(biped())).found["flip-x"].proof.sensors is None
