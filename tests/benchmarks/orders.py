@@ -51,7 +51,7 @@ OF_PRIOR: Mapping[str, tuple[object, ...]] = {"prior.consistency_coef": (0.03, 0
 TRIAL_SEEDS, SEEDS = "100,101,102", "0,1,2,3,4,5,6,7,8,9"
 EPISODES = 64
 """Per seed, of a final evaluation."""
-STEPS = {3: (60_000, 200_000), 8: (75_000, 200_000), 16: (0, 60_000)}
+STEPS = {3: (60_000, 200_000), 8: (50_000, 100_000), 16: (0, 40_000)}
 """By number of agents the environment steps per seed of a trial, and of the ten seeds that judge."""
 
 
