@@ -39,22 +39,25 @@ torch.set_num_threads(1)  # threads share the rows of a sum, so their number dec
 
 HASHES = Path(__file__).with_name("golden_weights.json")
 
-_NAVIGATION = "--task navigation --set mappo.num_envs=8 --set mappo.num_epochs=3 --steps 800"
+_NAVIGATION = "--task navigation --network mlp --set mappo.num_envs=8 --set mappo.num_epochs=3 --steps 800"
 _OFF_POLICY = "--seeds 2 --steps 1000 --set network.hidden=[16,16]"
 _FORMATION = "--task formation --seeds 2 --set task.horizon=40 --set task.num_agents=3"
 _WILDLIFE = "--task wildlife --seeds 2 --set task.horizon=16 --set network.hidden=[8,8]"
 
 CASES: dict[str, str] = {
     # every algorithm and every task
-    "navigation mappo": "--task navigation --seeds 2 --steps 5k",
+    "navigation mappo": "--task navigation --network mlp --seeds 2 --steps 5k",
+    "navigation mappo, sets": "--task navigation --seeds 2 --steps 3200 --set mappo.num_envs=16",
     "navigation mappo, all of c4, recomputed": (
-        "--task navigation --seeds 2 --steps 5k --transforms c4"
+        "--task navigation --network mlp --seeds 2 --steps 5k --transforms c4"
         " --set prior.copies=all --set prior.old_log_prob=recompute"
     ),
     "predator-prey mappo gru": (
         "--task predator-prey --seeds 2 --network gru --set mappo.num_envs=8 --set mappo.num_epochs=3 --steps 800"
     ),
-    "navigation maddpg": f"--task navigation --algo maddpg {_OFF_POLICY}",
+    "navigation maddpg": f"--task navigation --network mlp --algo maddpg {_OFF_POLICY}",
+    "navigation maddpg, sets": f"--task navigation --algo maddpg {_OFF_POLICY}",
+    "navigation qmix, sets": f"--task navigation --algo qmix {_OFF_POLICY}",
     "predator-prey qmix": f"--task predator-prey --algo qmix {_OFF_POLICY}",
     "formation mappo": f"{_FORMATION} --set mappo.num_envs=4 --set mappo.num_steps=40 --steps 320",
     "wildlife mappo": f"{_WILDLIFE} --set mappo.num_envs=8 --steps 256",
@@ -92,15 +95,15 @@ CASES: dict[str, str] = {
     "symmetrised": f"{_NAVIGATION} --set network.symmetrise=c4 --set network.hidden=[16,16]",
     # off-policy learners
     "maddpg, stored copies": (
-        f"--task navigation --algo maddpg {_OFF_POLICY} --transforms rot90"
+        f"--task navigation --network mlp --algo maddpg {_OFF_POLICY} --transforms rot90"
         " --set prior.replay=stored --set maddpg.actor_actions=own"
     ),
     "maddpg, forces, agents permuted": (
-        f"--task navigation --algo maddpg {_OFF_POLICY} --set task.actions=continuous"
+        f"--task navigation --network mlp --algo maddpg {_OFF_POLICY} --set task.actions=continuous"
         " --transforms o2*agents --set prior.stop_gradient=transformed"
     ),
     "maddpg, a reward each": (
-        f"--task navigation --algo maddpg {_OFF_POLICY} --set task.convention=pettingzoo"
+        f"--task navigation --network mlp --algo maddpg {_OFF_POLICY} --set task.convention=pettingzoo"
         " --transforms rot90,flip-y*agents-1-2-0 --set prior.copies=all --set prior.replay=stored"
     ),
     "paper's maddpg": "--task navigation --algo maddpg --preset paper --set maddpg.rounds=10 --steps 250",
