@@ -7,8 +7,6 @@ mirror changes the cue's sign and exchanges the joints with a sign. Needs rsl-rl
 from __future__ import annotations
 
 import json
-import sys
-from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
@@ -19,10 +17,8 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
 from esp_cli import Body, Field, Kind, layout
-from esp_cli.bodies.emitting import emitted
-
-sys.path.insert(0, str(Path(__file__).parent))
-from rsl_rl_recurrent import MirroredPPO
+from esp_cli.bodies.emitting import mirror_of
+from esp_cli.loop.rsl_rl import MirroredPPO
 
 ENVS, STEPS, HORIZON, UPDATES, SEEDS = 16, 24, 8, 80, 5
 GROUPS = {"actor": ["policy"], "critic": ["policy"]}
@@ -30,14 +26,11 @@ SETTINGS = {"num_learning_epochs": 4, "num_mini_batches": 2, "learning_rate": 1e
 SETTINGS |= {"gamma": 0.9, "lam": 0.9}
 
 
-def written_mirror() -> ModuleType:
-    """Write what `esp mirror --emit rsl_rl` writes for a model of this body, and import it."""
+def recall_mirror() -> ModuleType:
+    """Return the mirror of the observations and actions."""
     body = Body(["left", "right"], {"left": "-right"})
     seen = layout(Field("cue", Kind.PSEUDOSCALAR), Field("clock", Kind.SCALAR), body.positions())
-    text = emitted(body, {"policy": seen, "action": layout(body.positions())}, "recall")
-    Path("recall_mirror.py").write_text(text, encoding="utf-8")
-    sys.path.insert(0, str(Path.cwd()))
-    return import_module("recall_mirror")
+    return mirror_of(body, {"policy": seen, "action": layout(body.positions())})
 
 
 def target(cue: torch.Tensor) -> torch.Tensor:
@@ -93,7 +86,7 @@ def returns(mirror: ModuleType | None, seed: int) -> list[float]:
 def main() -> None:
     """Print the mean return of the last ten rollouts, and of rollouts 11 to 20, by seed."""
     found = {}
-    for name, mirror in (("plain", None), ("mirrored", written_mirror())):
+    for name, mirror in (("plain", None), ("mirrored", recall_mirror())):
         curves = [returns(mirror, seed) for seed in range(SEEDS)]
         found[name] = {"early": [sum(c[10:20]) / 10 for c in curves], "late": [sum(c[-10:]) / 10 for c in curves]}
         print(name, {when: [round(x, 3) for x in values] for when, values in found[name].items()}, flush=True)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import pprint
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from importlib.abc import Loader
+from importlib.util import module_from_spec
 from pathlib import Path
 from types import ModuleType
+from typing import cast
 
 import numpy as np
 
@@ -14,6 +17,8 @@ from esp_cli.bodies.body import Body
 from esp_cli.bodies.numbers import ACTION, Numbers, labels_of, map_of
 from esp_cli.defaults import __version__
 from esp_cli.symmetry.elements import Floats
+from esp_cli.symmetry.parse import parse_elements
+from esp_cli.symmetry.plane import PlaneElement
 from esp_envs.errors import UserError
 
 HOSTS = dict.fromkeys(("rsl_rl", "isaaclab", "mjlab"), "compute_symmetric_states")
@@ -32,22 +37,48 @@ def emitted(body: Body, numbers: Numbers, model: str) -> str:
     Raises:
         UserError: the body has no symmetry.
     """
-    if not body.elements:
+    return _filled(written, _data(body, numbers, model, body.elements))
+
+
+def mirror_of(body: Body, numbers: Numbers, group: str | None = None) -> ModuleType:
+    """Return what an `emitted` file would be once imported, without one: ELEMENTS, `mirrored`, `augment` and others.
+
+    Args:
+        body: of the robot.
+        numbers: what its observations and actions are.
+        group: the elements that leave your reward alone, such as "left-right"; by default all that the body has.
+
+    Raises:
+        UserError: the body has no symmetry, or lacks an element of the group.
+    """
+    wanted = body.elements
+    if group is not None:
+        parsed = list(map(PlaneElement.of, parse_elements(group, 1)))  # type: ignore[arg-type] # finite
+        wanted = tuple(element for element in parsed if element != PlaneElement())
+        if missing := [element.name for element in wanted if element not in body.elements]:
+            raise UserError(f"the body has no {missing[0]}; its group is {body.group}")
+    module = module_from_spec(written.__spec__)
+    cast("Loader", written.__spec__.loader).exec_module(module)
+    vars(module).update(_data(body, numbers, "the body", wanted))
+    return module
+
+
+def _data(body: Body, numbers: Numbers, model: str, elements: Sequence[PlaneElement]) -> dict[str, object]:
+    """Return the values of what `written` leaves open."""
+    if not elements:
         raise UserError(f"{model} has no symmetry, so there is no mirror to write")
     moves = {
-        name: {element.name: _move(map_of(layout, element)) for element in body.elements}
-        for name, layout in numbers.items()
+        name: {element.name: _move(map_of(layout, element)) for element in elements} for name, layout in numbers.items()
     }
-    data = {
+    return {
         "MODEL": model,
         "MADE_BY": f"esp mirror {__version__}",
-        "ELEMENTS": tuple(element.name for element in body.elements),
+        "ELEMENTS": tuple(element.name for element in elements),
         "PROOF": {name: f"accelerations agree to {found.proof.gap:.2g}" for name, found in body.found.items()},
         "NUMBERS": {name: labels_of(layout) for name, layout in numbers.items()},
         "ACTIONS": moves.pop(ACTION),
         "OBSERVATIONS": moves,
     }
-    return _filled(written, data)
 
 
 def proof(body: Body, numbers: Numbers, file: str) -> str:

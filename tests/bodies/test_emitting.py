@@ -111,6 +111,14 @@ def test_the_file_needs_neither_this_package_nor_torch(body, tmp_path):
     assert done.stdout.strip() == "(4, 39)"
 
 
+def test_without_rsl_rl_its_module_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "rsl_rl", None)
+    monkeypatch.setitem(sys.modules, "rsl_rl.algorithms", None)
+    monkeypatch.delitem(sys.modules, "esp_cli.loop.rsl_rl", raising=False)
+    with pytest.raises(ModuleNotFoundError, match=r"needs the extra rsl_rl, .* is missing: pip install"):
+        importlib.import_module("esp_cli.loop.rsl_rl")
+
+
 def test_rsl_rl_takes_the_file(body, tmp_path):
     symmetry = pytest.importorskip("rsl_rl.extensions.symmetry")
     from tensordict import TensorDict

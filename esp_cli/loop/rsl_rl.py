@@ -1,22 +1,35 @@
-"""PPO of rsl_rl for recurrent policies, with whole mirrored histories: `class_name: rsl_rl_recurrent:MirroredPPO`.
+"""rsl_rl: copies of what PPO trains on, and PPO for recurrent policies with whole mirrored histories.
+
+numbers = {"policy": layout(...), "critic": layout(...), "action": layout(body.positions())}  # by group
+symmetry_cfg = {"data_augmentation_func": data_augmentation_func(body, numbers), "use_data_augmentation": True}
 
 rsl_rl refuses symmetry for recurrent networks, since the hidden state of an original is not that of its mirror image.
-Here each mirror has hidden states of its own: while data is collected, actor and critic also see the mirrored
-observations, from the first step of each episode. Training then sees mirrored trajectories with their own states.
-`esp mirror ROBOT.xml --emit rsl_rl -o my_mirror.py` writes the module that is named as `mirror`.
+With `class_name: esp_cli.loop.rsl_rl:MirroredPPO` each mirror has hidden states of its own: while data is collected,
+actor and critic also see the mirrored observations, from the first step of each episode. Training then sees mirrored
+trajectories with their own states.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from types import ModuleType
 from typing import Any
 
 import torch
-from rsl_rl.algorithms import PPO
-from rsl_rl.storage import RolloutStorage
-from tensordict import TensorDict
+
+from esp_cli.bodies.body import Body
+from esp_cli.bodies.emitting import mirror_of
+from esp_cli.bodies.numbers import Numbers
+from esp_envs.installed import install
+
+try:
+    from rsl_rl.algorithms import PPO
+    from rsl_rl.storage import RolloutStorage
+    from tensordict import TensorDict
+except ModuleNotFoundError as error:
+    needed = f"esp_cli.loop.rsl_rl needs the extra rsl_rl, and {error.name} is missing: {install('rsl_rl')}"
+    raise ModuleNotFoundError(needed, name=error.name) from None
 
 State = torch.Tensor | tuple[torch.Tensor, ...] | None
 
@@ -26,17 +39,38 @@ def parts_of(state: State) -> tuple[torch.Tensor, ...]:
     return () if state is None else state if isinstance(state, tuple) else (state,)
 
 
+def data_augmentation_func(body: Body, numbers: Numbers, group: str | None = None) -> Callable[..., Any]:
+    """Return a function (env, obs, actions) of rsl_rl's `symmetry_cfg`, as a file of `esp mirror` has it.
+
+    It gives observations (a TensorDict of groups [B, D]) and actions [B, A], each followed by its copies; None for the
+    one that is None.
+
+    Args:
+        body: of the robot.
+        numbers: layouts of the observation groups by name, and of "action".
+        group: the elements that leave your reward alone, such as "left-right"; by default all that the body has.
+
+    Raises:
+        UserError: the body has no symmetry, or lacks an element of the group.
+    """
+    return mirror_of(body, numbers, group).compute_symmetric_states
+
+
 class MirroredPPO(PPO):
     """PPO whose batches hold each trajectory, then its image under each element of a mirror.
 
     Args:
-        mirror: the module that `esp mirror` wrote, or its name.
+        mirror: the module that `esp mirror` wrote, its name, or what `esp_cli.bodies.emitting.mirror_of` returns, also
+            by name as "my_robot:mirror".
         others: those of PPO; `symmetry_cfg` stays None.
     """
 
     def __init__(self, *args: Any, mirror: str | ModuleType, **others: Any) -> None:
         super().__init__(*args, **others)
-        self.mirror = import_module(mirror) if isinstance(mirror, str) else mirror
+        if isinstance(mirror, str):
+            module, _, name = mirror.partition(":")
+            mirror = getattr(import_module(module), name) if name else import_module(module)
+        self.mirror = mirror
         self.models = (self.actor, self.critic)
         self.states: dict[tuple[str, int], State] = {}
         self.saved: dict[tuple[str, int], list[torch.Tensor]] = {}

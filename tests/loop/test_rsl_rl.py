@@ -1,24 +1,26 @@
-"""Recurrent PPO of rsl_rl with mirrored histories: hidden states of mirrors are those of the whole mirrored history."""
+"""rsl_rl: copies of its batches, and recurrent PPO whose mirrors have the states of whole mirrored histories."""
 
 from __future__ import annotations
 
 import sys
-from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 pytest.importorskip("rsl_rl.algorithms")
+from rsl_rl.extensions.symmetry import Symmetry as Extension
 from rsl_rl.models import RNNModel
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
 from esp_cli import Body, Field, Kind, layout
-from esp_cli.bodies.emitting import emitted
+from esp_cli.bodies.emitting import emitted, mirror_of
+from esp_cli.bodies.numbers import numbers_of
+from esp_cli.loop.rsl_rl import MirroredPPO, data_augmentation_func
+from esp_envs.errors import UserError
 from tests.bodies.test_emitting import imported
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
-from rsl_rl_recurrent import MirroredPPO
+from tests.bodies.test_fields import anymal
 
 ENVS, STEPS = 6, 10
 GROUPS = {"actor": ["policy"], "critic": ["policy"]}
@@ -107,3 +109,38 @@ def test_training_uses_the_images_and_leaves_the_storage_as_it_was(mirror):
     assert all(torch.isfinite(torch.tensor(x)) for x in losses.values())
     assert "recurrent_mini_batch_generator" not in vars(ppo.storage)
     assert "get_kl_divergence" not in vars(ppo.actor)
+
+
+def test_rsl_rl_augments_groups_with_the_function_of_a_body(tmp_path):
+    body = anymal()
+    numbers = {
+        "policy": layout(body.gravity(), body.positions()),
+        "critic": layout(body.velocity(), body.contacts(["LF", "LH", "RF", "RH"])),
+        "action": layout(body.positions()),
+    }
+    obs = TensorDict({"policy": torch.randn(6, 15), "critic": torch.randn(6, 7)}, batch_size=[6])
+    ones, actions = torch.ones(6, 1), torch.randn(6, 12)
+    rows = {"old_actions_log_prob": ones, "values": ones, "advantages": ones, "returns": ones}
+    batch = SimpleNamespace(observations=obs, actions=actions, **rows)
+    extension = Extension(None, data_augmentation_func(body, numbers), use_data_augmentation=True)
+    extension.augment_batch(batch, 6)
+    assert (batch.observations.batch_size[0], len(batch.actions), len(batch.returns)) == (24, 24, 24)
+    written = imported(emitted(body, numbers, "anymal"), tmp_path).compute_symmetric_states(None, obs, actions)
+    assert torch.equal(batch.actions, written[1])
+    assert all(torch.equal(batch.observations[group], written[0][group]) for group in obs.keys())  # noqa: SIM118
+
+    one = data_augmentation_func(body, numbers, "left-right")
+    seen, nothing = one(env=None, obs=obs, actions=None)
+    assert nothing is None
+    assert torch.equal(seen["critic"][6:, 3:], obs["critic"][:, [5, 6, 3, 4]])
+    nothing, moved = one(env=None, obs=None, actions=actions)
+    assert nothing is None
+    assert torch.equal(moved, written[1][:12])
+    with pytest.raises(UserError, match="the body has no rot90; its group is d2"):
+        data_augmentation_func(body, numbers, "d4")
+
+
+def test_recurrent_ppo_takes_a_mirror_by_name(monkeypatch):
+    body = Body(["left", "right"], {"left": "-right"})
+    monkeypatch.setitem(sys.modules, "my_robot", SimpleNamespace(mirror=mirror_of(body, numbers_of(body, None))))
+    assert learner("my_robot:mirror").mirror.ELEMENTS == ("flip-x",)
