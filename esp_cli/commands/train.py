@@ -106,6 +106,7 @@ def train(
 
     from esp_cli import run as runs
     from esp_cli.commands.train_choices import plan_run
+    from esp_cli.training.config import is_prior_chosen
     from esp_cli.training.run_folder import RUN_FORMAT
     from esp_cli.training.trackers import require
 
@@ -138,6 +139,8 @@ def train(
     overrides = {name: value for name, value in short.items() if value is not None} | named
     resolved, weights, idle = plan_run(context, config, choices, overrides)
     options.note_without_effect(idle)
+    if resolved.prior.kind == "none" and config is None and not is_prior_chosen(overrides):
+        console.note(f"{task} declares no symmetry, so there is no prior; --prior auto weighs what holds")
     if print_config:
         console.write_json("-", RUN_FORMAT.document(resolved.model_dump(mode="json")))
         return

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
 from pydantic import BaseModel, Field, field_validator
@@ -19,6 +19,7 @@ from esp_cli.networks.build import AnyNetworkConfig, network_class
 from esp_cli.networks.plain import MlpConfig
 from esp_cli.prior import PriorConfig
 from esp_cli.symmetry import default_transforms
+from esp_cli.symmetry.admission import carries
 from esp_envs.errors import UserError
 from esp_envs.registry import TASKS, make, task_class
 from esp_envs.spec import TaskSpec
@@ -150,6 +151,7 @@ def resolve_config(
         device: "cpu" or "cuda".
         overrides: dotted names to values, such as "mappo.learning_rate"; text is read as JSON where that is possible.
 
+    Where the task carries no transform and nobody chose a setting of the prior, there is none.
     An unknown name or a value out of range is a UserError.
     """
     sections = _preset_sections(task, algorithm, preset, (overrides or {}).get("network.name"))
@@ -157,8 +159,12 @@ def resolve_config(
     task_settings = resolve_task_settings(task, sections["task"])
     prior = validated(PriorConfig, sections["prior"], "prior")
     if prior.kind != "none" and "transforms" not in sections["prior"] and not TASKS.ships(task):
-        chosen = default_transforms(make(task, 1, (0,), task_settings).spec, not prior.needs_declaration)
-        prior = prior.model_copy(update={"transforms": chosen})
+        spec = make(task, 1, (0,), task_settings).spec
+        chosen = default_transforms(spec, not prior.needs_declaration)
+        changes = {"transforms": chosen}
+        if not spec.roles and not carries(chosen, spec) and not is_prior_chosen(overrides or {}):
+            changes = {"kind": "none"}
+        prior = prior.model_copy(update=changes)
     learner = ALGORITHMS[algorithm]
     if prior.terms == "policy" and prior.coefficient > 0 and not learner.has_policy_term:
         raise UserError(
@@ -181,6 +187,11 @@ def resolve_config(
         "device": device,
     }
     return validated(RunConfig, values, "run")
+
+
+def is_prior_chosen(settings: Iterable[str]) -> bool:
+    """Return whether a user's settings, by dotted name, say anything of the prior."""
+    return any(name.startswith("prior.") for name in settings)
 
 
 def _override(

@@ -15,10 +15,12 @@ from esp_cli.bodies.kinds import INERTIA, PartsKind
 from esp_cli.bodies.numbers import map_of
 from esp_cli.bodies.showing import layouts_of
 from esp_cli.symmetry.plane import KIND_MATRICES, PlaneElement
+from esp_cli.training.config import resolve_config
 from esp_envs import generators_for, make, task_class
 from esp_envs.errors import UserError
 from esp_envs.spec import Continuous, Layout
 from tests.bodies.models import biped
+from tests.cli.running import esp
 
 pytest.importorskip("gymnasium")
 FLIP_X, FLIP_Y = PlaneElement(mirrored=True), PlaneElement("1/2", mirrored=True)
@@ -54,6 +56,19 @@ def test_what_holds_of_the_others(name, symmetry, width):
     env = make(name, 1, [0], {"workers": 0})
     assert (env.spec.symmetry, env.spec.observation.width, env.spec.horizon) == (symmetry, width, 1000)
     assert env.spec.nearly == ("flip-x" if name == "humanoid" else "")
+
+
+@pytest.mark.parametrize("name", ["halfcheetah", "halfcheetah2x3"])
+def test_where_nothing_holds_the_default_is_no_prior(name):
+    pytest.importorskip("gymnasium_robotics")
+    plain = resolve_config(name)
+    assert plain.prior.kind == "none"
+    assert plain.command().endswith(" --prior none")
+    assert resolve_config(name, overrides={"prior.kind": "none"}) == plain
+    assert resolve_config(name, overrides={"prior.kind": "esp"}).prior.kind == "esp"
+    said = esp("train", "--task", name, "--print-config").stderr
+    assert f"{name} declares no symmetry, so there is no prior; --prior auto weighs what holds" in said
+    assert "no prior" not in esp("train", "--task", name, "--prior", "none", "--print-config").stderr
 
 
 def test_walkers_mirror_exchanges_legs_and_swimmers_bends_the_other_way():
