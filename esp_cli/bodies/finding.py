@@ -36,10 +36,12 @@ class Difference:
     Attributes:
         what: "mass", "range", "gain", ...; empty where nothing differs.
         share: the difference over the larger of the two; of places, over the robot's size.
+        shares: those of all properties: masses, inertia, limits, gains, geometry of what collides, damping, ...
     """
 
     what: str
     share: float
+    shares: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,7 @@ def differences(frame: Frame, match: Match) -> list[Difference]:
             if model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT and match.ctrl[:, a].any():
                 shares |= _of_actuator(frame, match, int(a))
         what, share = max(shares.items(), key=lambda item: item[1])
-        found.append(Difference(what if share > 1e-9 else "", share))
+        found.append(Difference(what if share > 1e-9 else "", share, shares))
     return found
 
 
@@ -118,6 +120,7 @@ def _of_joint(frame: Frame, R: Floats, i: int, j: int) -> dict[str, float]:
     shares = {
         "mass": _share(frame.mass[b], frame.mass[c]),
         "middle of mass": float(np.linalg.norm(R @ frame.com[b] - frame.com[c]) / frame.size),
+        "geometry": max(_of_shapes(frame, R, b, c), _of_shapes(frame, R.T, c, b)),
         "inertia": _share(R @ frame.inertia[b] @ R.T, frame.inertia[c]),
         "damping": _share(model.dof_damping[v], model.dof_damping[w]),
         "armature": _share(model.dof_armature[v], model.dof_armature[w]),
@@ -131,6 +134,19 @@ def _of_joint(frame: Frame, R: Floats, i: int, j: int) -> dict[str, float]:
         limits = [model.jnt_range[k] * model.jnt_limited[k] - model.qpos0[frame.qpos_of(k)] for k in (i, j)]
         shares["range"] = _share(np.sort(sign * limits[0]), limits[1])
     return shares
+
+
+def _of_shapes(frame: Frame, R: Floats, b: int, c: int) -> float:
+    """Return how far what collides of a body is from the nearest of its kind on another, at most 1."""
+    worst = 0.0
+    for kind, place, spread in frame.shapes.get(b, []):
+        gaps = [
+            max(float(np.linalg.norm(R @ place - there) / frame.size), _share(R @ spread @ R.T, other))
+            for like, there, other in frame.shapes.get(c, [])
+            if like == kind
+        ]
+        worst = max(worst, min(gaps, default=1.0))
+    return min(worst, 1.0)
 
 
 def _of_actuator(frame: Frame, match: Match, a: int) -> dict[str, float]:

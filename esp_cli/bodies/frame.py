@@ -54,6 +54,7 @@ class Frame:
         self.anchor, self.axis = data.xanchor - self.centre, data.xaxis.copy()
         self.turned = data.xmat.reshape(-1, 3, 3).copy()
         axes = data.ximat.reshape(-1, 3, 3)
+        self._geoms = data.geom_xpos - self.centre, data.geom_xmat.reshape(-1, 3, 3).copy()
         self.inertia = axes * model.body_inertia[:, None] @ axes.transpose(0, 2, 1)
         self.mass, self.com = self._rigid_parts(data.xipos - self.centre)
         spread = np.concatenate([self.anchor, self.com[self.moving]])
@@ -88,6 +89,20 @@ class Frame:
         np.add.at(mass, owner, own)
         np.add.at(moment, owner, own[:, None] * com)
         return mass, moment / np.maximum(mass, 1e-12)[:, None]
+
+    @cached_property
+    def shapes(self) -> dict[int, list[tuple[int, Floats, Floats]]]:
+        """By moving body, the type, middle [3] and squared extent [3, 3] of each shape of it that collides.
+
+        A mesh has no extent, since its axes are those of its inertia and may be any.
+        """
+        model, found = self.model, dict[int, list[tuple[int, Floats, Floats]]]()
+        for g in np.flatnonzero(model.geom_contype | model.geom_conaffinity):
+            kind, axes = int(model.geom_type[g]), self._geoms[1][g]
+            half = model.geom_aabb[g, 3:] * (kind != mujoco.mjtGeom.mjGEOM_MESH)
+            body = int(model.body_weldid[model.geom_bodyid[g]])
+            found.setdefault(body, []).append((kind, self._geoms[0][g], axes * half**2 @ axes.T))
+        return found
 
     @cached_property
     def children(self) -> dict[int, list[int]]:

@@ -75,10 +75,12 @@ def described(body: Body, model: Path) -> dict[str, Any]:
                 "planted": planted,
                 "differs": d.what,
                 "by": d.share,
+                "differences": d.shares,
             }
             for joint, image, sign, gap, planted, d in body.rows(name)
         ]
-        elements[name] = {**one.proof.summary, "joints": joints}
+        base = {} if one.base is None else {"base": one.base.shares}
+        elements[name] = {**one.proof.summary, **base, "joints": joints}
     return {"model": str(model), "group": body.group, "elements": elements, "refused": body.refused}
 
 

@@ -79,7 +79,24 @@ def test_an_asymmetric_joint_is_named_with_what_differs():
     assert rows["right_knee"].what == rows["left_knee"].what == "damping"
     assert rows["right_knee"].share == pytest.approx(1 / 11)
     assert rows["left_yaw"].what == ""
+    told = {"mass", "middle of mass", "geometry", "inertia", "damping", "range", "gain", "force range", "axis"}
+    assert told <= set(rows["left_knee"].shares)
+    assert [what for what, share in rows["left_knee"].shares.items() if share > 1e-9] == ["damping"]
     assert body.found["flip-x"].proof.verdict == "nearly"
+
+
+@pytest.mark.parametrize(
+    ("shape", "share"),
+    [('size="0.1 0.04 0.03" pos="0.03 0 0"', 0.05), ('size="0.1 0.04 0.02" pos="0.03 0 0.01"', 0.0185)],
+)
+def test_shapes_that_collide_are_compared_where_masses_are_alike(shape, share):
+    inertia = '<inertial pos="0 0 0" mass="1" diaginertia="0.1 0.1 0.1"/>'
+    foot = '<geom type="box" size="0.1 0.04 0.02" pos="0.03 0 0"/>'
+    left, right = biped().replace(foot, inertia + foot).split('name="right_thigh"')
+    body = body_of(f'{left}name="right_thigh"{right.replace(foot, foot.replace(foot[16:-2], shape))}')
+    differ = {name: difference for name, *_, difference in body.rows("flip-x")}["left_yaw"]
+    assert differ.what == "geometry"
+    assert differ.share == pytest.approx(share, rel=0.01)
 
 
 def test_a_robot_with_one_leg_moved_has_no_mirror():
