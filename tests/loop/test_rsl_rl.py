@@ -9,14 +9,15 @@ import pytest
 import torch
 
 pytest.importorskip("rsl_rl.algorithms")
+from rsl_rl.algorithms import PPO
 from rsl_rl.extensions.symmetry import Symmetry as Extension
 from rsl_rl.models import RNNModel
+from rsl_rl.runners import OnPolicyRunner
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
 from esp_cli import Body, Field, Kind, layout
 from esp_cli.bodies.emitting import emitted, mirror_of
-from esp_cli.bodies.numbers import numbers_of
 from esp_cli.loop.rsl_rl import MirroredPPO, data_augmentation_func
 from esp_envs.errors import UserError
 from tests.bodies.test_emitting import imported
@@ -140,7 +141,39 @@ def test_rsl_rl_augments_groups_with_the_function_of_a_body(tmp_path):
         data_augmentation_func(body, numbers, "d4")
 
 
-def test_recurrent_ppo_takes_a_mirror_by_name(monkeypatch):
-    body = Body(["left", "right"], {"left": "-right"})
-    monkeypatch.setitem(sys.modules, "my_robot", SimpleNamespace(mirror=mirror_of(body, numbers_of(body, None))))
-    assert learner("my_robot:mirror").mirror.ELEMENTS == ("flip-x",)
+class Walk:
+    """Joints of ANYmal at random, in rsl_rl's form."""
+
+    num_envs, num_actions, max_episode_length, device, cfg = ENVS, 12, 7, "cpu", {}
+    episode_length_buf = torch.zeros(ENVS, dtype=torch.long)
+
+    def get_observations(self) -> TensorDict:
+        return TensorDict({"policy": torch.randn(ENVS, 39)}, batch_size=[ENVS])
+
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict]:
+        return self.get_observations(), -actions.square().sum(-1), torch.rand(ENVS) < 0.2, {}
+
+
+@pytest.mark.parametrize("recurrent", [False, True])
+def test_the_runner_learns_by_the_names_that_its_settings_give(recurrent, monkeypatch):
+    body = anymal()
+    joints = [body.positions(), body.velocities(), body.positions(name="actions")]
+    mirror = mirror_of(body, {"policy": layout(body.gravity(), *joints), "action": layout(body.positions())})
+    monkeypatch.setitem(
+        sys.modules, "my_robot", SimpleNamespace(mirror=mirror, augment=mirror.compute_symmetric_states)
+    )
+    model = {"class_name": "RNNModel" if recurrent else "MLPModel", "hidden_dims": [16]}
+    model |= {"rnn_type": "gru", "rnn_hidden_dim": 8} if recurrent else {}
+    symmetry = {"data_augmentation_func": "my_robot:augment", "use_data_augmentation": True, "use_mirror_loss": True}
+    plain = {"class_name": "PPO", "symmetry_cfg": symmetry}
+    mirrored = {"class_name": "esp_cli.loop.rsl_rl:MirroredPPO", "mirror": "my_robot:mirror"}
+    algorithm = {"num_learning_epochs": 1, "num_mini_batches": 2, **(mirrored if recurrent else plain)}
+    gauss = {"class_name": "GaussianDistribution", "init_std": 0.5}
+    settings = {"algorithm": algorithm, "actor": {**model, "distribution_cfg": gauss}, "critic": model.copy()}
+    settings |= {"obs_groups": GROUPS, "num_steps_per_env": STEPS, "save_interval": 100}
+    runner = OnPolicyRunner(Walk(), settings, None, "cpu")
+    before = [x.clone() for x in runner.alg.actor.parameters()]
+    runner.learn(2)
+    assert type(runner.alg) is (MirroredPPO if recurrent else PPO)
+    assert not recurrent or runner.alg.mirror is mirror
+    assert any(not torch.equal(x, y) for x, y in zip(before, runner.alg.actor.parameters(), strict=True))

@@ -496,6 +496,20 @@ def test_matrices_do_what_the_copies_do() -> None:
         Symmetry(observation=SEEN, action=FORCE, group="so2").matrices()
 
 
+def test_matrices_make_a_consistency_loss_in_jax() -> None:
+    jax = pytest.importorskip("jax")
+    matrices = Symmetry(observation=SEEN, action=FORCE, group="d4").matrices()
+
+    @jax.jit
+    def loss(weight: Any, obs: Any) -> Any:
+        return sum(((obs @ L.T @ weight - obs @ weight @ K.T) ** 2).mean() for _, L, K in matrices)
+
+    obs = random(5, 3).numpy()
+    equivariant = torch.eye(3, 2).numpy()  # a push along the vector that is seen
+    assert loss(equivariant, obs) < 1e-10
+    assert abs(jax.grad(loss)(random(3, 2).numpy(), obs)).max() > 0.1
+
+
 LIMBS = layout(Field("hips", Kind.PSEUDOSCALAR, 4), Field("knees", Kind.SCALAR, 4), Field("speed", Kind.VECTOR))
 
 
