@@ -13,23 +13,6 @@ constexpr int AXES = 3;
 
 namespace {
 
-// ---- Activations
-
-void activate(float *x, int64_t count, bool tanh) {
-    for (int64_t i = 0; i < count; i += LANES) {
-        Vec v = vec(x + i);
-        vec(x + i) = tanh ? tanh_of(v) : v < 0.0f ? Vec{} : v;
-    }
-}
-
-// Multiply a gradient by the slope of the activation, read off its output y.
-void times_slope(float *gradient, const float *y, int64_t count, bool tanh) {
-    for (int64_t i = 0; i < count; i += LANES) {
-        Vec g = vec(gradient + i), v = vec(y + i);
-        vec(gradient + i) = tanh ? g - g * v * v : v <= 0.0f ? Vec{} : g;
-    }
-}
-
 // ---- What perceptron.py fills in
 
 // Columns of the inputs, whose R rows are counted along axes, the last one fastest.

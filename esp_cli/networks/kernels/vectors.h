@@ -210,6 +210,21 @@ static inline Vec tanh_of(Vec x) {
     return x * p * reciprocal(q);
 }
 
+static inline void activate(float *x, int64_t count, bool tanh) {
+    for (int64_t i = 0; i < count; i += LANES) {
+        Vec v = vec(x + i);
+        vec(x + i) = tanh ? tanh_of(v) : v < 0.0f ? Vec{} : v;
+    }
+}
+
+// Multiply a gradient by the slope of the activation, read off its output y.
+static inline void times_slope(float *gradient, const float *y, int64_t count, bool tanh) {
+    for (int64_t i = 0; i < count; i += LANES) {
+        Vec g = vec(gradient + i), v = vec(y + i);
+        vec(gradient + i) = tanh ? g - g * v * v : v <= 0.0f ? Vec{} : g;
+    }
+}
+
 // Return log(x) of x > 0: x = 2^n (1 + f) with 1 + f around 1, and a polynomial of f (Cephes).
 static inline Vec log_of(Vec x) {
     Ints bits = (Ints)x, exponent = (bits >> 23) - 126;
