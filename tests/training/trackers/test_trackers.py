@@ -65,7 +65,8 @@ def test_a_tracker_that_fails_is_one_line_and_the_run_goes_on(
     monkeypatch.setattr(Failing, "way", way)
     monkeypatch.setattr(Failing, "rows", 0)
     monkeypatch.setattr(Failing, "closed", 0)
-    told = esp("train", *TINY_OPTIONS, *STEPS, "--seeds", "3,7", "--track", "wandb", "--out", tmp_path / "run")
+    words = ["--network", "mlp", *TINY_OPTIONS, *STEPS, "--seeds", "3,7", "--track", "wandb"]
+    told = esp("train", *words, "--out", tmp_path / "run")
     sentence = f"tracking with wandb ended: it cannot {way} (the server); the run goes on"
     assert told.stderr.splitlines().count(sentence) == 1
     assert Failing.rows == {"open": 0, "write": 2, "close": 4}[way]
