@@ -1,6 +1,7 @@
 """Networks over sets beside perceptrons, each with the prior and without it, tuned on equal steps.
 
-    python tests/benchmarks/orders.py --out runs/orders [--agents 3 8 16=8] [--draws 5] [--jobs 2] [--json orders.json]
+    python tests/benchmarks/orders.py --out runs/orders [--agents 3 8 16=8] [--methods NAME ...] [--draws 5]
+                                       [--jobs 2] [--json orders.json]
 
 For each number of agents every method trains the same settings, on three seeds and equal steps; the settings are
 drawn once for all methods, and the first are those of the preset `fast`. The mean of the last two greedy evaluations
@@ -51,7 +52,7 @@ OF_PRIOR: Mapping[str, tuple[object, ...]] = {"prior.consistency_coef": (0.03, 0
 TRIAL_SEEDS, SEEDS = "100,101,102", "0,1,2,3,4,5,6,7,8,9"
 EPISODES = 64
 """Per seed, of a final evaluation."""
-STEPS = {3: (60_000, 200_000), 8: (50_000, 100_000), 16: (0, 40_000)}
+STEPS = {3: (60_000, 200_000), 8: (40_000, 100_000), 16: (0, 40_000)}
 """By number of agents the environment steps per seed of a trial, and of the ten seeds that judge."""
 
 
@@ -93,9 +94,12 @@ def score(folder: Path) -> float:
 
 
 def judged(folder: Path) -> dict[str, object]:
-    """Return the final evaluation of a run: greedy returns by seed, anchors and the metrics of the task."""
+    """Return the final evaluation of a run by seed: greedy returns, the same normalised, and metrics; and anchors."""
     found = Run(folder).evaluate(EPISODES).model_dump(mode="json")
-    return {"greedy": found["greedy"]["per_seed"], "anchors": found["anchors"], "metrics": found["metrics_per_seed"]}
+    greedy, anchors = found["greedy"]["per_seed"], found["anchors"]
+    low, high = anchors["random"], anchors["heuristic"]
+    scores = [(value - low) / (high - low) for value in greedy]
+    return {"greedy": greedy, "normalised": scores, "anchors": anchors, "metrics": found["metrics_per_seed"]}
 
 
 def cell(out: Path, method: str, agents: int, tuned_at: int, count: int) -> dict[str, object]:
@@ -119,18 +123,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("runs/orders"))
     parser.add_argument("--agents", nargs="+", default=["3", "8", "16=8"], metavar="N", help="16=8: tuned with 8")
+    parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=list(METHODS), metavar="METHOD")
     parser.add_argument("--draws", type=int, default=5)
     parser.add_argument("--jobs", type=int, default=2, help="trainings side by side, each with one thread")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     pairs = [tuple(map(int, text.split("=") if "=" in text else (text, text))) for text in args.agents]
     with ThreadPoolExecutor(args.jobs) as pool:
-        asked = [pool.submit(cell, args.out, m, n, at, args.draws) for n, at in pairs for m in METHODS]
+        asked = [pool.submit(cell, args.out, m, n, at, args.draws) for n, at in pairs for m in args.methods]
         cells = [one.result() for one in asked]
     table = Table("agents", "method", "return", "normalised", "worst seed", "draw")
     for one in cells:
-        low, high = one["anchors"]["random"], one["anchors"]["heuristic"]
-        scores = [(value - low) / (high - low) for value in one["greedy"]]
+        scores = one["normalised"]
         best = max(range(args.draws), key=one["trials"].__getitem__)
         numbers = (f"{fmean(one['greedy']):.1f}", f"{fmean(scores):.2f}", f"{min(scores):.2f}", str(best))
         table.add_row(str(one["agents"]), one["method"], *numbers)
