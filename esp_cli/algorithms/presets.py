@@ -136,13 +136,11 @@ _ON_PARTICLES: Sections = {"mappo": {**_FEWER_PASSES, "gamma": 0.95, "gae_lambda
 FAST: dict[str, dict[str, Sections]] = {"mappo": {"navigation": _ON_PARTICLES, "predator-prey": _ON_PARTICLES}}
 
 # A network over sets learns each landmark and each agent once, not for every order of them.
+_SETS: Sections = {"network": {"name": "set"}}
 SETS: dict[str, dict[str, Sections]] = {
-    "mappo": {
-        "navigation": {"mappo": {**_FEWER_PASSES, "gamma": 0.95, "gae_lambda": 0.9, "critic_input": "state"}}
-        | {"network": {"name": "set"}}
-    },
-    "maddpg": {"navigation": {"network": {"name": "set"}}},
-    "qmix": {"navigation": {"network": {"name": "set"}}},
+    "mappo": {"navigation": {"mappo": {**_ON_PARTICLES["mappo"], "critic_input": "state"}, **_SETS}},
+    "maddpg": {"navigation": _SETS},
+    "qmix": {"navigation": _SETS},
 }
 
 # what a task changes in the preset `paper`, whose recurrent MAPPO needs whole episodes

@@ -94,30 +94,27 @@ def prove(frame: Frame, match: Match, seed: int = 0) -> Proof:
     """
     rng, data = np.random.default_rng(seed), mujoco.MjData(frame.model)
     samples = [_state(frame, data, rng) for _ in range(_STATES)]
-    here = _accelerations(frame, data, samples, _NO_CONSTRAINTS)
+    images = _images(match, samples)
+    here, there = (_accelerations(frame, data, states, _NO_CONSTRAINTS) for states in (samples, images))
 
-    def compared(tried: Match, count: int) -> tuple[Floats, float]:
-        there = _accelerations(frame, data, _images(tried, samples[:count]), _NO_CONSTRAINTS)
-        return _gaps(frame, tried, here[:count], there)
+    def mistaken(wrong: Match) -> float:
+        seen = _accelerations(frame, data, _images(wrong, samples[:_PLANTED]), _NO_CONSTRAINTS)
+        return float(_gaps(frame, wrong, here[:_PLANTED], seen)[0].max())
 
-    joints, median = compared(match, _STATES)
+    joints, median = _gaps(frame, match, here, there)
     if frame.model.neq:
-        joined, tied = (_accelerations(frame, data, s, _NO_LIMITS) for s in (samples, _images(match, samples)))
+        joined, tied = (_accelerations(frame, data, states, _NO_LIMITS) for states in (samples, images))
         joints = np.maximum(joints, _gaps(frame, match, joined, tied)[0])
-    planted = [
-        min(compared(wrong, _PLANTED)[0].max() for wrong in _mistakes(frame, match, joint))
-        for joint in range(frame.model.njnt)
-    ]
+    planted = [min(mistaken(wrong) for wrong in _mistakes(frame, match, joint)) for joint in range(frame.model.njnt)]
     lowered = [_lowered(frame, data, sample) for sample in samples[:_LYING]]
     lying = [sample for sample in lowered if sample is not None]
     pairs = [
-        [_accelerations(frame, data, states, flag) for states in (some, _images(match, some))]
-        for some, flag in ((samples, _NO_CONTACTS), (lying, 0))
+        [_accelerations(frame, data, states, flag) for states in (some, moved)]
+        for some, moved, flag in ((samples, images, _NO_CONTACTS), (lying, _images(match, lying), 0))
         if some
     ]
     medians = [_gaps(frame, match, *pair)[1] for pair in pairs]
-    shown = _sensors(frame.model, here, _accelerations(frame, data, _images(match, samples), _NO_CONSTRAINTS))
-    sensors, sensor = max(shown, default=(None, ""))
+    sensors, sensor = max(_sensors(frame.model, here, there), default=(None, ""))
     return Proof(joints, np.array(planted), median, medians[0], medians[1] if lying else None, sensors, sensor)
 
 

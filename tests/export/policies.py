@@ -14,6 +14,7 @@ from esp_cli.training.build import build_environment, generators
 from esp_cli.training.checkpoint import describe_policy, save_checkpoint
 from esp_cli.training.config import resolve_config
 from esp_envs.mpe.frozen_prey import POLICY_FORMAT
+from tests.algorithms.off_policy import on_perceptron
 
 KINDS = {
     "choice": ("navigation", "mappo", {}),
@@ -54,7 +55,7 @@ def drawn_policy(
     """Return policies whose weights are large enough to matter: those of a new one give all actions the same chance."""
     task, algorithm, settings = (KINDS | LARGE | REFUSED)[kind]
     overrides = {
-        **({"network.name": "mlp"} if task == "navigation" else {}),
+        **on_perceptron(task),
         "network.hidden": list(hidden),
         **settings,
         **({"network.near": near} if near else {}),

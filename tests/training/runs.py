@@ -2,6 +2,7 @@
 
 from esp_cli.training.config import RunConfig, resolve_config
 from esp_cli.training.run_folder import RunFolder
+from tests.algorithms.off_policy import on_perceptron
 
 TINY = {
     "mappo.num_envs": 2,
@@ -15,8 +16,7 @@ TINY = {
 
 def tiny_config(steps=300, seeds=(0, 1), task="navigation", **overrides) -> RunConfig:
     """A run of 50 steps an iteration that takes milliseconds."""
-    settings = TINY | ({"network.name": "mlp"} if task == "navigation" else {})
-    settings |= {name.replace("__", "."): value for name, value in overrides.items()}
+    settings = TINY | on_perceptron(task) | {name.replace("__", "."): value for name, value in overrides.items()}
     return resolve_config(task, steps=steps, seeds=seeds, overrides=settings)
 
 
