@@ -1,12 +1,13 @@
 """Networks over sets beside perceptrons, each with the prior and without it, tuned on equal steps.
 
     python tests/benchmarks/orders.py --out runs/orders [--agents 3 8 16=8] [--methods NAME ...] [--draws 5]
-                                       [--jobs 2] [--json orders.json]
+                                       [--jobs 2] [--json orders.json] [--tuned EARLIER.json]
 
 For each number of agents every method trains the same settings, on three seeds and equal steps; the settings are
 drawn once for all methods, and the first are those of the preset `fast`. The mean of the last two greedy evaluations
 chooses. The chosen settings then train ten other seeds, whose final evaluation is the result. `16=8` judges 16 agents
-with the settings chosen for 8. Called again with the same folder it goes on where it stopped.
+with the settings chosen for 8; `--tuned` takes the trials that an earlier call wrote instead of training them again.
+Called again with the same folder it goes on where it stopped.
 """
 
 from __future__ import annotations
@@ -102,12 +103,27 @@ def judged(folder: Path) -> dict[str, object]:
     return {"greedy": greedy, "normalised": scores, "anchors": anchors, "metrics": found["metrics_per_seed"]}
 
 
-def cell(out: Path, method: str, agents: int, tuned_at: int, count: int) -> dict[str, object]:
-    """Tune a method, train the seeds that judge it, and return what is on record of it."""
+Trials = dict[tuple[str, int], list[float]]
+"""Scores of the draws by method and number of agents."""
+
+
+def trials_on_file(path: Path | None, count: int) -> Trials:
+    """Return the trials that an earlier call wrote; refused where it drew other settings or trained other steps."""
+    if path is None:
+        return {}
+    document = json.loads(path.read_text())
+    found: Trials = {(one["method"], one["tuned at"]): one["trials"] for one in document["cells"]}
+    if document["draws"] != list(draws(count)) or any(document["steps"][str(n)][0] != STEPS[n][0] for _, n in found):
+        raise SystemExit(f"{path}: its trials had other settings or steps; give the same --draws.")
+    return found
+
+
+def cell(out: Path, method: str, agents: int, tuned_at: int, count: int, known: Trials) -> dict[str, object]:
+    """Tune a method where its trials are not known, train the seeds that judge it, and return what is on record."""
     slug = method.replace(", ", "-").replace(" ", "-")
     tried = list(draws(count))
-    scores = []
-    for number, chosen in enumerate(tried):
+    scores = list(known.get((method, tuned_at), ()))
+    for number, chosen in list(enumerate(tried))[len(scores) :]:
         folder = out / "trials" / f"{tuned_at}-{slug}-{number}"
         scores.append(score(trained(folder, words_of(method, tuned_at, STEPS[tuned_at][0], TRIAL_SEEDS, chosen))))
         print(f"{folder.name}: {scores[-1]:.1f}", flush=True)
@@ -115,7 +131,8 @@ def cell(out: Path, method: str, agents: int, tuned_at: int, count: int) -> dict
     words = words_of(method, agents, STEPS[agents][1], SEEDS, tried[best])
     found = judged(trained(out / "judged" / f"{agents}-{slug}", words))
     print(f"{agents} {method}: draw {best}, {fmean(found['greedy']):.1f}", flush=True)
-    return {"agents": agents, "method": method, "words": words, "trials": scores, "tuned at": tuned_at} | found
+    tuning = {"trials": scores, "draw": best, "tuned at": tuned_at}
+    return {"agents": agents, "method": method, "words": words} | tuning | found
 
 
 def main() -> None:
@@ -127,16 +144,17 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=5)
     parser.add_argument("--jobs", type=int, default=2, help="trainings side by side, each with one thread")
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--tuned", type=Path, metavar="FILE", help="JSON of an earlier call, whose trials stand")
     args = parser.parse_args()
+    known = trials_on_file(args.tuned, args.draws)
     pairs = [tuple(map(int, text.split("=") if "=" in text else (text, text))) for text in args.agents]
     with ThreadPoolExecutor(args.jobs) as pool:
-        asked = [pool.submit(cell, args.out, m, n, at, args.draws) for n, at in pairs for m in args.methods]
+        asked = [pool.submit(cell, args.out, m, n, at, args.draws, known) for n, at in pairs for m in args.methods]
         cells = [one.result() for one in asked]
     table = Table("agents", "method", "return", "normalised", "worst seed", "draw")
     for one in cells:
         scores = one["normalised"]
-        best = max(range(args.draws), key=one["trials"].__getitem__)
-        numbers = (f"{fmean(one['greedy']):.1f}", f"{fmean(scores):.2f}", f"{min(scores):.2f}", str(best))
+        numbers = (f"{fmean(one['greedy']):.1f}", f"{fmean(scores):.2f}", f"{min(scores):.2f}", str(one["draw"]))
         table.add_row(str(one["agents"]), one["method"], *numbers)
     Console(width=110).print(table)
     if args.json:
