@@ -26,7 +26,9 @@ NO_MIRROR = (mujoco.mjtSensor.mjSENS_USER, mujoco.mjtSensor.mjSENS_PLUGIN)
 """Kinds of sensors of which nobody knows what their readings mean."""
 _STATES, _LYING, _PLANTED = 48, 24, 12
 """States that are compared, those that are laid on the floor, and those for each planted mistake."""
-_NO_CONSTRAINTS, _NO_CONTACTS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT), int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+_NO_CONSTRAINTS, _NO_SENSORS, _NO_CONTACTS = (
+    int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in ("CONSTRAINT", "SENSOR", "CONTACT")
+)
 _NO_LIMITS = int(mujoco.mjtDisableBit.mjDSBL_LIMIT | mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS) | _NO_CONTACTS
 Sample = tuple[Floats, Floats, Floats, Floats]
 """qpos, qvel, ctrl and forces on the degrees of freedom."""
@@ -110,18 +112,18 @@ def prove(frame: Frame, match: Match, seed: int = 0) -> Proof:
     here, there = (_accelerations(frame, data, states, _NO_CONSTRAINTS) for states in (samples, images))
 
     def mistaken(wrong: Match) -> float:
-        seen = _accelerations(frame, data, _images(wrong, samples[:_PLANTED]), _NO_CONSTRAINTS)
+        seen = _accelerations(frame, data, _images(wrong, samples[:_PLANTED]), _NO_CONSTRAINTS | _NO_SENSORS)
         return float(_gaps(frame, wrong, here[:_PLANTED], seen)[0].max())
 
     joints, median = _gaps(frame, match, here, there)
     if frame.model.neq:
-        joined, tied = (_accelerations(frame, data, states, _NO_LIMITS) for states in (samples, images))
+        joined, tied = (_accelerations(frame, data, states, _NO_LIMITS | _NO_SENSORS) for states in (samples, images))
         joints = np.maximum(joints, _gaps(frame, match, joined, tied)[0])
     planted = [min(mistaken(wrong) for wrong in _mistakes(frame, match, joint)) for joint in range(frame.model.njnt)]
     lowered = [_lowered(frame, data, sample) for sample in samples[:_LYING]]
     lying = [sample for sample in lowered if sample is not None]
     pairs = [
-        [_accelerations(frame, data, states, flag) for states in (some, moved)]
+        [_accelerations(frame, data, states, flag | _NO_SENSORS) for states in (some, moved)]
         for some, moved, flag in ((samples, images, _NO_CONTACTS), (lying, _images(match, lying), 0))
         if some
     ]
