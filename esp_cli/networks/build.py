@@ -15,7 +15,7 @@ from pydantic import BeforeValidator, SerializeAsAny
 from esp_cli.files.documents import validate
 from esp_cli.networks.contract import ActivationName, IoSpec, Network, NetworkConfig
 from esp_cli.networks.plain import MlpConfig, PlainConfig
-from esp_cli.networks.symmetrised import Symmetrised
+from esp_cli.networks.symmetrised import LOCAL, LocalFrame, Symmetrised
 from esp_envs.errors import UserError
 from esp_envs.installed import Registry
 
@@ -89,4 +89,5 @@ def build_network(
             f"network.symmetrise averages over images of the observation alone, but this {config.name} reads more; "
             "leave it off, or choose a network without memory"
         )
-    return Symmetrised(network, io, config.symmetrise)
+    local, group = config.symmetrise.startswith(LOCAL), config.symmetrise.removeprefix(LOCAL)
+    return (LocalFrame if local else Symmetrised)(network, io, group)

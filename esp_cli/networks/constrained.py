@@ -12,13 +12,14 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from esp_cli.networks.contract import VJP, ActivationName, IoSpec, Memoryless, Network, NetworkConfig
-from esp_cli.networks.layers import GAINS, orthogonal
+from esp_cli.networks.layers import GAINS, SeedMLP, orthogonal
 from esp_cli.networks.perceptron import Shape, affine, perceptron, perceptron_with_vjp
 from esp_cli.symmetry import FiniteGroup
 from esp_cli.symmetry.maps import Block, block_width, intertwiners, regular
 from esp_envs.errors import UserError
 
-Relaxation = Literal["residual", "weights"]
+Relaxation = Literal["residual", "weights", "gate"]
+_CLOSED = 3.0  # a gate begins at sigmoid(-3) = 0.05
 
 
 def copies_for(width: int, group: FiniteGroup, banks: int = 1) -> int:
@@ -140,7 +141,9 @@ class EquivariantConfig(NetworkConfig):
         0.0, ge=0, le=10, description="how fast each layer can leave the symmetry; 0: exactly equivariant"
     )
     relaxation: Relaxation = Field(
-        "residual", description="by a plain layer beside each, or by weights that differ between a feature's outputs"
+        "residual",
+        description="by a plain layer beside each, by weights that differ between a feature's outputs, or by a gate: a "
+        "plain network beside the whole, by a share that depends on the input",
     )
 
     def without_effect(self) -> frozenset[str]:
@@ -149,7 +152,14 @@ class EquivariantConfig(NetworkConfig):
     def build(
         self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
     ) -> Network:
-        return Equivariant(generators, self.io_or_refuse(io), self, output_gain)
+        if not self.relax or self.relaxation != "gate":
+            return Equivariant(generators, self.io_or_refuse(io), self, output_gain)
+        exact = Equivariant(generators, self.io_or_refuse(io), self.model_copy(update={"relax": 0.0}), output_gain)
+        free, gate = (
+            SeedMLP(generators, (inputs, *self.hidden, width), self.activation, gain)
+            for width, gain in ((outputs, output_gain), (1, 0.0))
+        )
+        return Gated(exact, free, gate, self.relax)
 
 
 class Equivariant(Memoryless):
@@ -193,3 +203,21 @@ class Equivariant(Memoryless):
         """Return weights and biases of the plain perceptron that this one is, in the order of `perceptron`."""
         layers: list[ConstrainedLinear] = [*self.layers]
         return [made for layer in layers for made in (layer.weight(), layer.bias())]
+
+
+class Gated(Memoryless):
+    """y = (1 - a(x)) E(x) + a(x) F(x) with a(x) = sigmoid(relax g(x) - 3): E commutes with the group, F and g need not.
+
+    g begins at 0, so a begins at 0.05 everywhere and learns where, and in which features, the symmetry is broken. That
+    is the idea of PEnGUiN (McClellan et al., 2025), which has such a share in every layer of a graph network.
+
+    Shape:
+        x: [S, B, in] -> [S, B, out].
+    """
+
+    def __init__(self, exact: Equivariant, free: SeedMLP, gate: SeedMLP, relax: float) -> None:
+        super().__init__()
+        self.exact, self.free, self.gate, self.relax = exact, free, gate, relax
+
+    def forward(self, x: Tensor) -> Tensor:
+        return torch.lerp(self.exact(x), self.free(x), torch.sigmoid(self.relax * self.gate(x) - _CLOSED))

@@ -77,7 +77,8 @@ class NetworkConfig(Strict, ABC):
     symmetrise: str | None = Field(
         None,
         max_length=100,
-        description="a group: the outputs for all images of the input are pulled back and averaged",
+        description="a group: outputs for all images of the input are pulled back and averaged; local-d4: that of one "
+        "image alone, in the frame of the input's vectors",
     )
 
     @abstractmethod

@@ -1,4 +1,4 @@
-"""The equivariant ensemble: the outputs of any network for all images of its input, pulled back and averaged."""
+"""Any network made equivariant: by all images of its input, or by the one image in the input's own frame."""
 
 from __future__ import annotations
 
@@ -8,11 +8,14 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from esp_cli.networks.contract import IoSpec, Network
+from esp_cli.networks.contract import IoSpec, Memoryless, Network
 from esp_cli.symmetry.maps import map_of
 from esp_cli.symmetry.representation import layout_operator
 from esp_envs.errors import UserError
-from esp_envs.spec import ActionSpace, Discrete
+from esp_envs.spec import ActionSpace, Discrete, Kind, Layout
+
+LOCAL = "local-"
+"""Begins the name of a group whose elements are chosen by the input's frame, as "local-d4"."""
 
 
 class Symmetrised(Network):
@@ -54,6 +57,46 @@ class Symmetrised(Network):
         shape = (self.group.order * x.shape[1], x.shape[2])
         images = self._images(x.flatten(1, 2)).unflatten(1, shape)
         return self._mean(self.network.unroll(images, truncation).flatten(1, 2)).unflatten(1, x.shape[1:3])
+
+
+class LocalFrame(Memoryless, Symmetrised):
+    """y = rho_out(g)^-1 f(rho_in(g) x) with g = g(x), the frame of x: equivariant, at the cost of f alone.
+
+    g(x) is the element whose image of the sum of all vectors of x lies nearest to a direction within one sector of the
+    group, so that g(h x) = g(x) h^-1. That is the idea of LEGO (Wang et al., 2025), whose frame is the agent's velocity
+    and the side of the centre of all. Where two images are as near, as for a sum of 0, the first is taken.
+    """
+
+    def __init__(self, network: Network, io: IoSpec, group: str) -> None:
+        super().__init__(network, io, group)
+        if network.memory_width or network.team > 1:
+            raise UserError(
+                f"network.symmetrise={LOCAL}{group} is for networks without memory and messages; use {group}"
+            )
+        angle = math.pi / self.group.order
+        along = _on_vectors(io.layout, (math.cos(angle), math.sin(angle)))
+        if not any(along):
+            raise UserError(f"network.symmetrise={LOCAL}{group} needs vectors, and {io.spaces.label} shows none")
+        self.along: Tensor
+        self.register_buffer("along", torch.tensor(along), False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        images = self._images(x).unflatten(1, (self.group.order, -1))  # [S, G, B, in]
+        chosen = (images @ self.along).argmax(1)  # [S, B]
+        own = images.gather(1, chosen[:, None, :, None].expand(-1, 1, -1, x.shape[-1]))
+        y = self.network.unroll(own.transpose(1, 2))  # [S, B, 1, out]
+        return (y @ self.back[chosen]).squeeze(-2)
+
+
+def _on_vectors(layout: Layout, direction: tuple[float, float]) -> list[float]:
+    """Return a row of a layout with the same direction in each of its vectors and 0 in all else."""
+    row: list[float] = []
+    for field in layout.fields:
+        if field.kind == Kind.RECORD:
+            row += _on_vectors(Layout(field.parts), direction) * field.count
+        else:
+            row += (direction if field.kind == Kind.VECTOR else (0.0,) * field.item_width) * field.count
+    return row
 
 
 def action_parts(space: ActionSpace) -> Tensor:

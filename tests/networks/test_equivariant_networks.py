@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor, nn
 
 from esp_cli.networks.build import NETWORKS, NetworkConfig, build_network
-from esp_cli.networks.constrained import ConstrainedLinear
-from esp_cli.networks.contract import IoSpec
+from esp_cli.networks.constrained import ConstrainedLinear, Gated
+from esp_cli.networks.contract import IoSpec, Memoryless
 from esp_cli.networks.layers import SeedMLP, orthogonal
 from esp_cli.networks.message_passing import MessagePassing, PictureEncoder, distinct
-from esp_cli.networks.symmetrised import Symmetrised
+from esp_cli.networks.symmetrised import LocalFrame, Symmetrised
 from esp_cli.symmetry import PlaneElement, cyclic, dihedral, parse_group, transform_set
 from esp_cli.symmetry.maps import Block, layout_blocks, regular, trivial
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
 from esp_envs import make
-from esp_envs.spec import Field, Kind, TaskSpec
+from esp_envs.spec import Field, Kind, Spaces, TaskSpec, discrete_moves, layout
 from tests.networks.gradients import assert_same_gradients
 from tests.symmetry.checks import network_equivariance_error
 
@@ -146,6 +148,28 @@ def test_the_equivariant_network_for_vectors_is_exact_and_a_perceptron_is_not(ta
     plain = NETWORKS["mlp"](hidden=(16, 16))
     assert errors(spec, plain, obs, state, group, reads) > 1e-2
     assert errors(spec, plain.model_copy(update={"symmetrise": group}), obs, state, group, reads) < EXACT
+    local = plain.model_copy(update={"symmetrise": f"local-{group}"})
+    assert errors(spec, local, obs, state, group, reads) < EXACT
+
+
+class Echo(Memoryless):
+    """Shows what it is asked about."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x
+
+
+def test_a_local_frame_by_hand() -> None:
+    """Of the turns of (0, 3) + (-1, 0), that by -90 degrees, (3, 1), lies nearest to the direction of 45 degrees."""
+    seen = layout(Field("velocity", Kind.VECTOR), Field("goal", Kind.VECTOR), Field("age", Kind.SCALAR))
+    spaces = Spaces(num_agents=1, observation=seen, state=seen, action=discrete_moves(4), symmetry="c4")
+    network = LocalFrame(Echo(), IoSpec(spaces, "own", num_values=5), "c4")
+    row = torch.tensor([[[0.0, 3.0, -1.0, 0.0, 7.0]]])
+    torch.testing.assert_close(network.step(row, row[..., :0])[0], torch.tensor([[[3.0, 0.0, 0.0, 1.0, 7.0]]]))
+    torch.testing.assert_close(network.unroll(row.unsqueeze(2))[:, :, 0], torch.tensor([[[3.0, 0.0, 0.0, 1.0, 7.0]]]))
+    blind = replace(spaces, observation=layout(Field("age", Kind.SCALAR)))
+    with pytest.raises(ValueError, match=r"network\.symmetrise=local-c4 needs vectors, and the task shows none"):
+        LocalFrame(Echo(), IoSpec(blind, "own", num_values=1), "c4")
 
 
 def test_a_recurrent_ensemble_keeps_the_memories_of_its_images_apart() -> None:
@@ -273,6 +297,7 @@ def test_drones_out_of_reach_are_not_heard() -> None:
         ("navigation", {"network.name": "equivariant", "network.group": "so2"}, "finite group that moves no agents"),
         ("navigation", {"network.name": "equivariant", "network.group": "c8"}, "no action"),
         ("navigation", {"network.symmetrise": "agents"}, "choose a finite group that moves no agents"),
+        ("navigation", {"network.name": "gru", "network.symmetrise": "local-d4"}, "for networks without memory"),
         ("navigation", {"network.name": "equivariant", "network.layer_norm": True}, "the network equivariant has name"),
     ],
 )
@@ -311,6 +336,22 @@ def test_a_relaxed_network_begins_equivariant_and_can_give_it_up(relaxation: str
     stir(strict)
     assert symmetry_gap(strict, spec, obs) < 10 * EXACT
     assert len(list(strict.parameters())) < len(list(network.parameters()))
+
+
+def test_a_gate_begins_nearly_closed_and_learns_where_to_open() -> None:
+    """With a = sigmoid(relax g - 3), where g begins at 0: 1 / (1 + e^3) = 0.0474."""
+    spec, obs, _ = scene("navigation")
+    network, rows = relaxed(spec, 0.5, "gate"), obs.flatten(1, 2)
+    assert isinstance(network, Gated)
+    exact, free = network.exact(rows), network.free(rows)
+    torch.testing.assert_close(network(rows), exact + 0.0474259 * (free - exact))
+    assert symmetry_gap(network.exact, spec, obs) < EXACT < symmetry_gap(network, spec, obs)
+    network(rows).square().sum().backward()
+    assert sum(parameter.grad.abs().max() > 0 for parameter in network.gate.parameters()) == 2, "of its last layer"
+    stir(network)
+    exact, free, share = network.exact(rows), network.free(rows), torch.sigmoid(0.5 * network.gate(rows) - 3)
+    torch.testing.assert_close(network(rows), (1 - share) * exact + share * free)
+    assert share.std() > 1e-3, "it differs between places"
 
 
 @pytest.mark.parametrize(("relax", "relaxation"), [(0.0, "weights"), (0.5, "residual"), (0.5, "weights")])
