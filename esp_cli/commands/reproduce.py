@@ -1,28 +1,100 @@
-"""`esp reproduce`: the paper's tables, from training to the numbers."""
+"""`esp reproduce`: the paper's tables, and a benchmark of methods for symmetry, from training to the numbers."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from esp_cli.commands.study_options import StudyChoices, study_command
-from esp_cli.commands.studying import run_or_forecast
+from esp_cli.commands import studying
+from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
+from esp_cli.console.progress import stop_requests
+from esp_envs.errors import UserError
+
+if TYPE_CHECKING:
+    from esp_cli.studies.symmetry import Benchmark
 
 EPILOG = """Examples:\n
     esp reproduce table1 --dry-run\n
     esp reproduce table1 --steps 500k --seeds 10 --out runs/table1\n
     esp reproduce table1 --tasks navigation,predator-prey --algos mappo --steps 500k,3M\n
-    esp reproduce agents --algos qmix"""
+    esp reproduce agents --algos qmix\n
+    esp reproduce symmetry --tasks navigation,navigation-region --methods 'plain,ESP,sets, ESP,auto'"""
 
 
-@study_command
+@study_command(tasks="Tasks, as navigation,formation; by default the paper's, or those of the benchmark.")
 def reproduce(
     table: Annotated[
-        Literal["table1", "agents"],
-        typer.Argument(help="Table 1, or the supplement's table for 2, 3 and 4 agents.", metavar="TABLE"),
+        Literal["table1", "agents", "symmetry"],
+        typer.Argument(
+            help="Table 1, the supplement's table for 2, 3 and 4 agents, or methods for symmetry, each tuned alike.",
+            metavar="TABLE",
+        ),
     ],
     choices: StudyChoices,
+    methods: Annotated[
+        list[str] | None,
+        typer.Option("--methods", help="For symmetry: what is compared, by the names in the table; by default all."),
+    ] = None,
+    budget: Annotated[
+        int | None,
+        typer.Option("--budget", min=1, max=1000, help="For symmetry: trials of each method on each task; default 5."),
+    ] = None,
 ) -> None:
-    """Train, evaluate and tabulate what a table of the paper shows; called again, it goes on where it was."""
-    run_or_forecast(table, choices.request(), choices)
+    """Train, evaluate and tabulate what a table shows; called again, it goes on where it was."""
+    if table == "symmetry":
+        from esp_cli.studies.symmetry import METHODS, Benchmark
+
+        request = replace(choices.request(), variants=parse_names(methods, METHODS))
+        (_forecast if choices.dry_run else _judge)(Benchmark(request, budget or 5), choices)
+        return
+    if methods or budget:
+        raise UserError("--methods and --budget are for esp reproduce symmetry; leave them out")
+    studying.run_or_forecast(table, choices.request(), choices)
+
+
+def _forecast(benchmark: Benchmark, choices: StudyChoices) -> None:
+    from esp_cli.studies.forecast import forecast_tuned
+
+    out, request = choices.folder("symmetry"), benchmark.request
+    with studying.open_resources(choices, out, request.device) as resources:
+        jobs = resources.jobs
+    pairs = {
+        f"{name}: {method}": (benchmark.config(name, method, 0, True), benchmark.config(name, method, 0, False))
+        for name, method in benchmark.taken
+    }
+    with studying.measuring(len(pairs)) as listener:
+        title, counts = benchmark.trials().title, (benchmark.budget, 1)
+        found = forecast_tuned(title, out, pairs, counts, request.episodes, jobs, listener)
+    studying.print_forecast(found, choices.json, f"{benchmark.budget} trials of each, and the run that judges it")
+
+
+def _judge(benchmark: Benchmark, choices: StudyChoices) -> None:
+    from esp_cli.studies.scheduler import Scheduler
+    from esp_cli.studies.study import StudyFolder
+    from esp_cli.studies.symmetry import Trials
+    from esp_cli.training.folder_names import FRESH
+
+    out: Path = choices.folder("symmetry")
+    planned, fresh = benchmark.trials(), None
+    with (
+        studying.open_resources(choices, out, benchmark.request.device) as resources,
+        Trials.held(out),
+        stop_requests("stopping every run after its iteration") as requests,
+    ):
+        trials = Trials.create(out, planned)
+        trials.check = resources.check
+        failed = studying.follow(
+            Scheduler(trials, trials.cells_of(planned), resources.jobs, resources.engine), requests
+        )
+        if not (requests or failed):
+            study = benchmark.judged(trials)
+            fresh = StudyFolder.create(out / FRESH, study)
+            failed = studying.run_cells(fresh, study, resources, requests)
+    if requests:
+        raise studying.stopped(choices.command)
+    if fresh is not None:
+        studying.report_study(fresh, choices.json, None, ())
+    studying.refuse_failed(failed, out)

@@ -128,6 +128,23 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike, paired: bool = False)
     return Estimate(float(u) / (first.size * second.size), _interval((first, second), _share_of_wins))
 
 
+def rank_sum_p(x: ArrayLike, y: ArrayLike) -> float:
+    """Return the two-sided p of the rank-sum test (Mann and Whitney): how likely so unequal samples of one law are."""
+    return float(scipy.stats.mannwhitneyu(_sample(x), _sample(y)).pvalue)
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Return p-values corrected for their number (Holm, 1979): the k-th smallest of m, k from 0, times m - k.
+
+    A corrected value is at least that of every smaller one, and at most 1.
+    """
+    corrected, largest = [0.0] * len(p_values), 0.0
+    for k, index in enumerate(np.argsort(p_values, kind="stable")):
+        largest = max(largest, min(1.0, (len(p_values) - k) * p_values[index]))
+        corrected[index] = largest
+    return corrected
+
+
 def average_improvement(pairs: Mapping[str, tuple[ArrayLike, ArrayLike]]) -> Estimate:
     """Return the probability of improvement, paired by seed, as a mean over tasks with a stratified bootstrap."""
     wins = {task: _wins(_sample(x), _sample(y)) for task, (x, y) in pairs.items()}

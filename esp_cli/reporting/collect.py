@@ -177,7 +177,10 @@ def _results(study: Study, states: Mapping[str, _State], mode: Mode, thresholds:
     for cell in study.cells:
         own = {key: value for key, value in configs[cell.name].items() if key not in shared}
         cells.append(_cell(study, cell, states[cell.name], mode).model_copy(update={"config": own}))
-    same = {name: getattr(study, name) for name in ("kind", "title", "command", "esp_version", "rows", "episodes")}
+    same = {
+        name: getattr(study, name)
+        for name in ("kind", "title", "command", "esp_version", "rows", "episodes", "left_out")
+    }
     results = Results(**same, mode=mode, config=shared, cells=tuple(cells))
     timed = tuple(_timed(results, cell, states[cell.name].curve, thresholds) for cell in cells)
     return summarised(results.model_copy(update={"cells": timed}))
@@ -213,7 +216,7 @@ def _cell(study: Study, cell: Cell, state: _State, mode: Mode) -> CellResult:
             fields["area_under_curve"] = _rounded(area_under_curve(compared.steps, compared.values))
     if curve is not None:
         fields["seconds"] = round(curve.seconds, 1)
-        if kind.breakings and (early := curve.until(cell.config.steps // 5)):
+        if (kind.breakings or kind.benchmark) and (early := curve.until(cell.config.steps // 5)):
             fields["early"] = _rounded(early.values[-1])
     same = {name: getattr(cell, name) for name in ("name", "panel", "variant", "reference")}
     fields |= {"step": state.step, "at": state.at, "steps": cell.config.steps, "seeds": cell.config.seeds}

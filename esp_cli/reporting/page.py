@@ -33,6 +33,7 @@ from esp_cli.reporting.figures import Style
 from esp_cli.reporting.results import RESULTS_FORMAT, CellResult, Results, Side
 from esp_cli.reporting.study_figures import draw_curves, draw_variants
 from esp_cli.reporting.tables import all_tables, markdown_text
+from esp_cli.studies.kinds import kind_of
 from esp_cli.training.folder_names import POLICY
 from esp_cli.training.metrics import read_metrics
 from esp_cli.training.run_folder import RunFolder
@@ -193,10 +194,24 @@ def answer(material: Material) -> list[str]:
     if len(pairs) == 1:
         both = pairs[0]
         return [_returns(results, *both), _verdict(*both), *_steps(material, *both)]
+    if pairs and kind_of(results.kind).benchmark:
+        return [_ranking(panel, results) for panel in dict.fromkeys(cell.panel for cell, _ in pairs)]
     texts = _count(pairs) if pairs else [_returns(results, cell) for cell in finished[:2]]
     if means := [f"{name} {one.mean.value:.2f}" for name, one in results.aggregates.items()]:
         texts.append(f"Mean normalised return over all panels, {_SCALE}: {', '.join(means)}.")
     return texts or ["No run has a return yet."]
+
+
+def _ranking(panel: str, results: Results) -> str:
+    """State which method of a panel is highest, and which are ahead of the reference or behind it."""
+    cells = [(cell, cell.summary) for cell in results.cells if cell.panel == panel and cell.summary is not None]
+    iqm, best = max((summary.iqm.value, cell.variant) for cell, summary in cells if summary.iqm is not None)
+    sides = {side: [c.variant for c, s in cells if s.gap is not None and s.gap.ahead == side] for side in _VERDICTS}
+    first = next(cell.variant for cell, _ in cells if cell.reference is None)
+    counts = "; ".join(f"{_VERDICTS[side][3:]} {first}: {', '.join(names)}" for side, names in sides.items() if names)
+    return (
+        f"{panel}: {best} has the highest IQM, {iqm:.2f}; after Holm's correction, {counts or 'nothing is compared'}."
+    )
 
 
 def _returns(results: Results, *cells: CellResult) -> str:

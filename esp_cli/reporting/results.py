@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, JsonValue
 from esp_cli.defaults import Mode
 from esp_cli.files.documents import DocumentFormat
 from esp_cli.policies.statistics import (
+    CONFIDENCE,
     Estimate,
     Floats,
     Passing,
@@ -24,12 +25,15 @@ from esp_cli.policies.statistics import (
     aggregate,
     average_improvement,
     difference,
+    holm,
     interquartile_mean,
     leader,
     normalised,
     probability_of_improvement,
+    rank_sum_p,
     summarise,
 )
+from esp_cli.studies.kinds import kind_of
 from esp_cli.studies.paper import NUM_SEEDS
 
 RESULTS_FORMAT = DocumentFormat("esp-results", 1, "the results of a study")
@@ -47,8 +51,9 @@ class Gap:
     # of improvement over the reference, seed by seed if `paired`; None for fewer than three seeds
     probability: Estimate | None
     over_all_pairs: Estimate | None  # the same with every seed against every seed, as Agarwal et al. define it
-    # by whether the interval of the difference holds 0; None for fewer than three seeds, or no interval
+    # by whether the interval of the difference holds 0, or by `holm`; None for fewer than three seeds, or no interval
     ahead: Side | None
+    holm: float | None = None  # in a benchmark, p of the rank-sum test, corrected for the comparisons of the panel
 
 
 @dataclass(frozen=True)
@@ -59,6 +64,7 @@ class CellSummary:
     iqm: Estimate | None = None  # interquartile mean
     normalised: SeedSummary | None = None  # 0 is the random policy, 1 the best of the task's heuristics
     area: SeedSummary | None = None  # mean height of the learning curve
+    normalised_area: SeedSummary | None = None  # the same, normalised, in a benchmark
     gap: Gap | None = None  # to the cell's reference
     # "first" where our mean is higher than the paper's, "second" where the paper's is
     leader: Literal["first", "second", "neither"] | None = None
@@ -101,7 +107,7 @@ class CellResult(BaseModel):
     anchors: dict[str, float] = {}  # mean returns of the reference policies
     metrics: dict[str, float | None] = {}  # the task's measures of the greedy policy
     evaluations: int | None = None  # on the way
-    # returns by seed at the evaluation nearest to a fifth of the run, in a study of broken symmetry
+    # returns by seed at the evaluation nearest to a fifth of the run, in a study of broken symmetry or a benchmark
     early: Numbers | None = None
     area_under_curve: Numbers | None = None  # mean height of the learning curve, by seed
     steps_to: tuple[Passing, ...] = ()  # first steps at thresholds
@@ -125,6 +131,7 @@ class Results(BaseModel):
     episodes: int
     config: dict[str, JsonValue]  # settings by dotted name that all cells share
     cells: tuple[CellResult, ...] = Field(min_length=1)  # in the study's order
+    left_out: dict[str, str] = {}  # by "TASK: METHOD" why there is no such cell
     aggregates: dict[str, Aggregate] = {}  # statistics over all panels by variant, where there are several panels
 
     def reference_of(self, cell: CellResult) -> CellResult | None:
@@ -144,6 +151,8 @@ def read_results(path: Path) -> Results:
 def summarised(results: Results) -> Results:
     """Return results with the statistics of each cell and over all panels, computed from its numbers."""
     cells = tuple(cell.model_copy(update={"summary": summarise_cell(results, cell)}) for cell in results.cells)
+    if kind_of(results.kind).benchmark:
+        cells = _corrected(results, cells)
     return results.model_copy(update={"cells": cells, "aggregates": aggregates(results)})
 
 
@@ -157,11 +166,14 @@ def summarise_cell(results: Results, cell: CellResult) -> CellSummary | None:
     if not good.size or returns.mean is None:
         return CellSummary(returns)
     scores, ours = normalised(good, cell.anchors), (returns.mean, returns.sem, good.size)
+    area = None if cell.area_under_curve is None else floats(cell.area_under_curve)
+    scaled = None if area is None or not kind_of(results.kind).benchmark else normalised(area, cell.anchors)
     return CellSummary(
         returns,
         iqm=interquartile_mean(good),
         normalised=None if scores is None else summarise(scores),
-        area=None if cell.area_under_curve is None else summarise(floats(cell.area_under_curve)),
+        area=None if area is None else summarise(area),
+        normalised_area=None if scaled is None else summarise(scaled),
         gap=_gap(results, cell, values),
         leader=None if cell.paper is None else leader(ours, (*cell.paper, NUM_SEEDS)),
     )
@@ -217,6 +229,24 @@ def _gap(results: Results, cell: CellResult, values: Floats) -> Gap | None:
         of_all = probability_of_improvement(values, others)
         chance = probability_of_improvement(values, others, paired=True) if paired else of_all
     return Gap(gained, paired, chance, of_all, None if of_all is None else side_of(gained.ci95))
+
+
+def _corrected(results: Results, cells: tuple[CellResult, ...]) -> tuple[CellResult, ...]:
+    """Return cells that are ahead or behind by the rank-sum test, with Holm's correction for those of their panel."""
+    ranked: dict[str, dict[str, tuple[CellSummary, Gap, float]]] = {}
+    for cell in cells:
+        other, summary = results.reference_of(cell), cell.summary
+        if other is not None and summary is not None and summary.gap is not None and summary.gap.over_all_pairs:
+            p = rank_sum_p(*(floats(one.returns[results.mode]) for one in (cell, other)))
+            ranked.setdefault(cell.panel, {})[cell.name] = summary, summary.gap, p
+    changed: dict[str, CellSummary] = {}
+    for own in ranked.values():
+        corrected = holm([p for *_, p in own.values()])
+        for (name, (summary, gap, _)), p in zip(own.items(), corrected, strict=True):
+            better = gap.over_all_pairs is not None and gap.over_all_pairs.value > 1 / 2
+            side: Side = "level" if p > 1 - CONFIDENCE else "ahead" if better else "behind"
+            changed[name] = replace(summary, gap=replace(gap, ahead=side, holm=p))
+    return tuple(c.model_copy(update={"summary": changed[c.name]}) if c.name in changed else c for c in cells)
 
 
 def side_of(interval: tuple[float, float] | None) -> Side | None:

@@ -19,6 +19,8 @@ NOT_RUN, _STOPPED = "not run", "every seed stopped"
 AHEAD = {"ahead": "yes", "behind": "no", "level": "not told apart", None: NOTHING}
 _LEADER = {"first": "ours", "second": "paper", "neither": "not told apart", None: NOTHING}
 _MARKUP = re.compile(r"[\\`*<|]|\](?=\()")
+_BY_INTERVALS = "Ahead: the 95 % interval of the difference lies above 0."
+_BY_RANKS = "Ahead: by the rank-sum test at 5 %, with Holm's correction for the comparisons of a panel."
 _SHARES = ("share of reference run>", "ratio of median steps>")
 Row = TypeVar("Row")
 Columns = dict[str, Callable[[Row], str]]  # heading -> text of a row
@@ -95,8 +97,11 @@ def comparison_table(results: Results) -> Table:
         "minus reference>": _beside(lambda gap: f"{gap.difference.value:+.2f} {format_interval(gap.difference.ci95)}"),
         "P(improvement)>": _beside(lambda gap: _estimate(gap.probability)),
         "over all pairs>": _beside(lambda gap: _estimate(gap.over_all_pairs)),
-        "ahead of reference": _beside(lambda gap: AHEAD[gap.ahead]),
     }
+    corrected = kind_of(results.kind).benchmark
+    if corrected:
+        columns["p, corrected>"] = _beside(lambda gap: NOTHING if gap.holm is None else f"{gap.holm:.3f}")
+    columns["ahead of reference"] = _beside(lambda gap: AHEAD[gap.ahead])
     if has_paper:
         columns |= {
             "paper>": lambda cell: format_mean(*cell.paper) if cell.paper and _summary(cell) else NOTHING,
@@ -108,7 +113,7 @@ def comparison_table(results: Results) -> Table:
     caption = (
         f"The reference is {_reference(results)}, compared seed by seed"
         f"{'' if by_seed else ' where both have the same seeds'}; over all pairs: "
-        f"every seed with every seed. Ahead: the 95 % interval of the difference lies above 0. {welch}{drawn}"
+        f"every seed with every seed. {_BY_RANKS if corrected else _BY_INTERVALS} {welch}{drawn}"
         "No interval is widened for the number of comparisons."
     )
     return table(f"Beside the reference{' and the paper' if has_paper else ''}", columns, results.cells, caption)
@@ -116,17 +121,19 @@ def comparison_table(results: Results) -> Table:
 
 def statistics_table(results: Results) -> Table:
     """Return further statistics of each cell: robust mean, scale, and how fast it learned."""
+    benchmark = kind_of(results.kind).benchmark
     columns: Columns[CellResult] = {
         **_NAMES,
         "seeds>": _known(lambda summary: str(sum(value is not None for value in summary.returns.per_seed))),
         "IQM>": _known(lambda summary: _estimate(summary.iqm)),
         "normalised>": _known(lambda summary: mean_text(summary.normalised)),
         "mean over the run>": _known(lambda summary: mean_text(summary.area)),
+        **({"normalised area>": _known(lambda one: mean_text(one.normalised_area))} if benchmark else {}),
         "training>": lambda cell: NOTHING if cell.seconds is None else format_duration(cell.seconds),
     }
     caption = (
         "IQM: mean without the lowest and the highest quarter of the seeds, rounded down. Normalised: 0 is the random "
-        "policy, 1 the best heuristic. Mean over the run: area under the curve."
+        f"policy, 1 the best heuristic. Mean over the run: area under the curve{', also normalised' * benchmark}."
     )
     if any(cell.early for cell in results.cells):
         columns["return at 20 %>"] = lambda cell: mean_text(summarise(floats(cell.early))) if cell.early else NOTHING
@@ -165,6 +172,16 @@ def steps_table(results: Results) -> Table:
     return Table("Steps to a return", headings, tuple(rows), caption)
 
 
+def left_out_table(results: Results) -> Table:
+    """Return why a benchmark has no run of a method on a task."""
+    alike: dict[tuple[str, str], list[str]] = {}
+    for name, reason in results.left_out.items():
+        task, _, method = name.rpartition(": ")
+        alike.setdefault((task, reason), []).append(method)
+    rows = tuple((task, "; ".join(methods), reason) for (task, reason), methods in alike.items())
+    return Table("Left out", ("task", "methods", "reason"), rows)
+
+
 def aggregates_table(results: Results) -> Table:
     """Return the numbers over all panels; no rows where no variant is finished in two."""
     numbers = results.aggregates
@@ -200,6 +217,7 @@ TABLES: Mapping[str, Callable[[Results], Table]] = {
     "statistics": statistics_table,
     "steps": steps_table,
     "aggregates": aggregates_table,
+    "left-out": left_out_table,
     "provenance": provenance_table,
 }
 """In the order of a report; each takes results with their statistics."""

@@ -62,7 +62,7 @@ def without_effect(name: str, request: Request) -> list[str]:
     return [
         setting
         for setting in request.overrides
-        if all(task_setting(setting, c.task) in names for c, names in idle if _concerns(setting, c.task, c.algorithm))
+        if all(task_setting(setting, c.task) in names for c, names in idle if concerns(setting, c.task, c.algorithm))
     ]
 
 
@@ -155,13 +155,13 @@ def _config(kind: StudyKind, task: str, algorithm: str, steps: int, request: Req
     if kind.papers_network and request.preset != "paper" and task in SETS.get(algorithm, {}):
         settings["network.name"] = "mlp"
     for name, value in request.overrides.items():
-        if _concerns(name, task, algorithm):
+        if concerns(name, task, algorithm):
             settings[task_setting(name, task)] = value
     settings |= choice
     return resolve_config(task, algorithm, request.preset, steps, request.seeds, request.device, settings)
 
 
-def _concerns(name: str, task: str, algorithm: str) -> bool:
+def concerns(name: str, task: str, algorithm: str) -> bool:
     """Return whether a setting is one of all runs, or of those of this task or algorithm."""
     section = name.rpartition(".")[0]
     return section in (task, algorithm) or section not in (*ALGORITHMS, *task_names())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -93,16 +93,33 @@ def forecast_search(
     tuning: Tuning, out: Path, seeds: Sequence[int], episodes: int, jobs: int, listener: Callable[[int], object]
 ) -> Forecast:
     """Measure what a search costs where all trials take as long as the default settings and none is pruned."""
-    runs, trials = list[RunForecast](), tuning.budget
-    for prior in tuning.priors:
-        trial, last = (measure(tuning.config(prior, {}, own), episodes) for own in (tuning.trial_seeds, seeds))
-        seconds = trials * trial.training_s + 2 * (last.training_s + last.evaluation_s)
-        disk = trials * trial.disk_bytes + 2 * last.disk_bytes
-        peak = disk + max(one.peak_bytes - one.disk_bytes for one in (trial, last))
-        name, count = f"{trials} trials, prior {prior}", len(tuning.trial_seeds)
-        runs.append(RunForecast(name, "waiting", tuning.steps, 0, count, seconds, disk, peak))
-        listener(len(runs))
+    pairs = {
+        f"{tuning.budget} trials, prior {prior}": (tuning.config(prior, {}), tuning.config(prior, {}, seeds))
+        for prior in tuning.priors
+    }
     title = f"Tuning of {tuning.algorithm.upper()} on {tuning.task}"
+    return forecast_tuned(title, out, pairs, (tuning.budget, 2), episodes, jobs, listener)
+
+
+def forecast_tuned(
+    title: str,
+    out: Path,
+    pairs: Mapping[str, tuple[RunConfig, RunConfig]],
+    counts: tuple[int, int],
+    episodes: int,
+    jobs: int,
+    listener: Callable[[int], object],
+) -> Forecast:
+    """Measure runs that are tuned and judged: by name a trial and a run that judges, and how many there are of each."""
+    known, runs, (trials, judged) = dict[str, Cost](), list[RunForecast](), counts
+    for name, configs in pairs.items():
+        trial, last = (_cost(config, episodes, known) for config in configs)
+        seconds = trials * trial.training_s + judged * (last.training_s + last.evaluation_s)
+        disk = trials * trial.disk_bytes + judged * last.disk_bytes
+        peak = disk + max(one.peak_bytes - one.disk_bytes for one in (trial, last))
+        steps, count = configs[0].steps, len(configs[0].seeds)
+        runs.append(RunForecast(name, "waiting", steps, 0, count, seconds, disk, peak))
+        listener(len(runs))
     return _added_up(title, out, jobs, sum(run.seconds for run in runs) / jobs, runs)
 
 

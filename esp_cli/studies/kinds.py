@@ -66,6 +66,8 @@ class StudyKind:
     # returns whose first passing is reported; by default that which the reference ended with
     thresholds: tuple[float, ...] = ()
     network_cost: bool = False  # whether to state the sizes of the networks, and to draw the paper's numbers as lines
+    # whether it compares methods: by the rank-sum test with Holm's correction, with returns at a fifth of the run
+    benchmark: bool = False
     # what a run is compared with, in words, where the plain learner is among the runs
     reference: str = "the plain learner (the first run) of the same panel"
     otherwise: str = "the first run of the same panel"  # the same where it is not
@@ -190,8 +192,10 @@ _TUNED = replace(
     reference="the plain run, tuned beside tuned and default beside default, and of a tuned plain run the default one",
     otherwise="the default run with the same kind of prior",
 )
+_FIRST = "the first method of the same task"
+_BENCHMARK = replace(_OTHER, network_cost=True, benchmark=True, reference=_FIRST, otherwise=_FIRST)
 
 
 def kind_of(name: str) -> StudyKind:
-    """Return what tells a kind of study from others; there are some that no command plans, such as tuned settings."""
-    return _TUNED if name == "tuned" else KINDS.get(name, _OTHER)
+    """Return what tells a kind of study from others; some are not planned by the catalogue, such as tuned settings."""
+    return {"tuned": _TUNED, "symmetry": _BENCHMARK}.get(name) or KINDS.get(name, _OTHER)

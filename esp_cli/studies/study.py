@@ -54,6 +54,7 @@ class Study(Strict):
     esp_version: str = __version__  # of the program that planned it
     rows: Literal["panels", "variants"] = Field(description="what the rows of the table are; the other are columns")
     cells: tuple[Cell, ...]  # in the order in which they are run and shown
+    left_out: dict[str, str] = Field({})  # by "TASK: METHOD" why there is no such cell
 
     @property
     def panels(self) -> list[str]:
@@ -119,7 +120,8 @@ class StudyFolder(RunSet):
         if not wanted - set(known) and all(new == old for new, old in again):
             return cls(path, there), False
         commands = [*there.command.splitlines(), study.command] if rest else [study.command]
-        merged = {"cells": study.cells + rest, "command": "\n".join(dict.fromkeys(commands))}
+        merged: dict[str, object] = {"cells": study.cells + rest, "command": "\n".join(dict.fromkeys(commands))}
+        merged |= {"left_out": there.left_out | study.left_out}
         return cls(path, study.model_copy(update=merged)), True
 
     @classmethod

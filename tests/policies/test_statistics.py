@@ -17,11 +17,13 @@ from esp_cli.policies.statistics import (
     bootstrap_interval,
     curve_band,
     difference,
+    holm,
     interquartile_mean,
     mean_and_sem,
     median_steps,
     normalised,
     probability_of_improvement,
+    rank_sum_p,
     spread_over_episodes,
     steps_to_threshold,
 )
@@ -126,6 +128,20 @@ def test_probability_of_improvement_by_hand():
 def test_probability_of_improvement_of_parted_groups_is_one_without_an_interval():
     assert probability_of_improvement([5.0, 6.0, 7.0], [1.0, 2.0]) == Estimate(1.0, None)
     assert probability_of_improvement([1.0, 2.0], [5.0, 6.0, 7.0]) == Estimate(0.0, None)
+
+
+def test_holms_correction_by_hand():
+    # ascending 0.005 * 4, 0.01 * 3, 0.03 * 2, 0.04 * 1, and none below the one before it
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([0.7, 0.6]) == [1.0, 1.0]
+    assert holm([0.2]) == [0.2]
+    assert holm([]) == []
+
+
+def test_the_rank_sum_test_by_hand():
+    # of the 20 ways to choose three ranks of six, one has all the highest and one all the lowest
+    assert rank_sum_p([4.0, 5.0, 6.0], [1.0, 2.0, 3.0]) == pytest.approx(2 / 20)
+    assert rank_sum_p([1.0, 4.0], [2.0, 3.0]) == pytest.approx(1.0)
 
 
 def test_steps_to_threshold_by_hand():

@@ -1,0 +1,263 @@
+"""The benchmark of symmetry: each method tuned on equal steps on each task, then judged by seeds that no trial had."""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from esp_cli.checking.measured import planned
+from esp_cli.files.formatting import file_name, format_exactly
+from esp_cli.files.writing import replace_file
+from esp_cli.prior.config import of_no_use_to
+from esp_cli.studies.catalogue import Request, concerns, task_setting
+from esp_cli.studies.kinds import KINDS, Settings
+from esp_cli.studies.run_set import Cell, StudyError
+from esp_cli.studies.study import Study, StudyFolder
+from esp_cli.training.build import build_learner
+from esp_cli.training.config import RunConfig, resolve_config
+from esp_cli.training.folder_names import FRESH, METRICS
+from esp_cli.training.metrics import column, read_metrics
+from esp_envs.errors import UserError
+from esp_envs.registry import TASKS as TASK_CLASSES
+
+PERCEPTRON, HOMOMORPHIC = "<perceptron>", "<homomorphic>"
+"""Stand for the plain network of a task and for the one that commutes with a group: numbers and pictures differ."""
+_PLAIN: Settings = {"network.name": PERCEPTRON, "prior.kind": "none"}
+_ESP: Settings = {"network.name": PERCEPTRON, "prior.kind": "esp"}
+_SETS: Settings = {"network.name": "set", "prior.kind": "none", "mappo.critic_input": "state"}
+_RELAXED: Settings = {**_PLAIN, "network.name": "equivariant", "network.group": "d4", "network.relax": 1.0}
+METHODS: Mapping[str, Settings] = {
+    "plain": _PLAIN,
+    "ESP": _ESP,
+    "copies": {**_ESP, "prior.kind": "augment"},
+    "consistency": {**_ESP, "prior.kind": "consistency"},
+    "ESP and orders of agents": {**_ESP, "prior.transforms": "d4*agents"},
+    "sets": _SETS,
+    "sets, ESP": {**_SETS, "prior.kind": "esp"},
+    "equivariant sets": {**_SETS, "network.name": "set-equivariant"},
+    "partially equivariant": {**_RELAXED, "network.relaxation": "gate"},
+    "local frames": {**_PLAIN, "network.symmetrise": "local-d4"},
+    "homomorphic network": {**_PLAIN, "network.name": HOMOMORPHIC, "network.group": "d4"},
+    "frame averages": {**_PLAIN, "network.symmetrise": "d4"},
+    **{name: {**_PLAIN, **chosen} for name, chosen in KINDS["ablate-breaking"].variants.items() if name != "ESP"},
+}
+"""The settings of each method, by its name in tables."""
+
+
+@dataclass(frozen=True)
+class Board:
+    """A task of the benchmark, and how long methods are tuned and judged there."""
+
+    task: str  # its name
+    settings: Settings = field(default_factory=dict)  # of every run, over those of the preset
+    trial_steps: int = 60_000  # environment steps per seed of a trial
+    steps: int = 200_000  # of the runs that judge
+    preset: str = "default"
+    networks: tuple[str, str] = ("mlp", "equivariant")  # plain, and homomorphic
+    batches: bool = False  # whether horizon and batch are tuned too; their space is that of particle tasks
+
+
+_NAVIGATION, _PREDATOR_PREY = (Board(name, preset="fast", batches=True) for name in ("navigation", "predator-prey"))
+
+
+BROKEN: Mapping[str, Settings] = {
+    "subgroup": {"task.action_turn_rad": 1.57},
+    "feature": {"task.reward_offset": 0.3},
+    "region": {"task.mud": 0.9},
+    "approximately": {"task.wind": 0.3},
+}
+"""The four ways of breaking of PEnGUiN (McClellan et al., 2025): turns alone are left, the landmarks of the reward are
+not where they are seen, half of the plane is muddy, and all moves are nearly symmetric."""
+_VMAS = "esp_envs.adapters.vmas_scenarios"
+TASKS: Mapping[str, Board] = {
+    "navigation": _NAVIGATION,
+    "navigation-8": replace(_NAVIGATION, settings={"task.num_agents": 8}, trial_steps=40_000, steps=100_000),
+    "predator-prey": _PREDATOR_PREY,
+    "wildlife": Board("wildlife", networks=("mpn", "empn")),
+    "formation": Board("formation", {"evaluation.every_steps": 20_000}, 200_000, 500_000),
+    "vmas-navigation": Board(f"{_VMAS}:Navigation"),
+    "vmas-dispersion": Board(f"{_VMAS}:Dispersion"),
+    **{
+        f"{board.task}-{way}": replace(board, settings=settings)
+        for board in (_NAVIGATION, _PREDATOR_PREY)
+        for way, settings in BROKEN.items()
+    },
+}
+"""By the name that the tables have; other tasks stand for themselves."""
+
+SPACE: Mapping[str, tuple[object, ...]] = {
+    "mappo.learning_rate": (1e-3, 2e-3, 4e-3, 8e-3),
+    "mappo.entropy_coef": (0.001, 0.003, 0.01, 0.03),
+    "mappo.gamma": (0.9, 0.95, 0.98, 0.99),
+    "mappo.gae_lambda": (0.8, 0.9, 0.95),
+    "mappo.num_epochs": (3, 5, 8),
+    "mappo.num_minibatches": (2, 5, 10),
+    "mappo.num_envs": (64, 128),
+    "prior.consistency_coef": (0.03, 0.1, 0.3, 1.0),
+}
+_OF_NETWORKS: Mapping[str, tuple[object, ...]] = {"network.relax": (0.1, 0.3, 1.0, 3.0)}
+_OF_BATCHES = frozenset({"mappo.gamma", "mappo.num_minibatches", "mappo.num_envs"})
+TRIAL_SEEDS = (100, 101, 102)
+_SCORED = 2  # greedy evaluations at the end of a trial whose mean is its score
+
+
+def draws(count: int) -> list[dict[str, object]]:
+    """Return the settings to try, the same for every method and task: none but the preset's, then drawn ones."""
+    found: list[dict[str, object]] = [{} for _ in range(count)]
+    for seed, space in enumerate((SPACE, _OF_NETWORKS)):
+        generator = random.Random(seed)
+        for one in found[1:]:
+            one.update((name, generator.choice(values)) for name, values in space.items())
+    return found
+
+
+def score(run: Path) -> float:
+    """Return the mean of a trial's last two greedy evaluations over its seeds, -inf where one is not finite."""
+    _, returns = column(read_metrics(run / METRICS), "eval/return_greedy")
+    return float(np.nan_to_num(returns[-_SCORED:], nan=-np.inf).mean())
+
+
+class Trials(StudyFolder):
+    """The trials of a benchmark: runs without a final evaluation, in whose folder `fresh` is the study that judges."""
+
+    def is_finished(self, cell: Cell) -> bool:
+        return self.is_trained(cell)
+
+    @classmethod
+    def create(cls, path: Path, study: Study) -> Trials:
+        """Make the folder, or go on with it; what is judged already gets no further trials."""
+        if StudyFolder.is_one(path / FRESH) and cls.is_one(path):
+            known = {cell.name for cell in cls.open(path).study.cells}
+            done = {cell.name for cell in StudyFolder.open(path / FRESH).study.cells}
+            for cell in study.cells:
+                if cell.name not in known and (judged := cell.name.rpartition("-")[0]) in done:
+                    raise StudyError(
+                        f"{path / FRESH} has judged {judged} already; keep its --budget, or choose another --out"
+                    )
+        return cls(path, super().create(path, study).study)
+
+
+class Benchmark:
+    """What is asked for: the methods that each task takes, and why the others are left out.
+
+    Attributes:
+        taken: names of task and method, in the order of the tables.
+        left_out: by "TASK: METHOD" why the task does not take the method.
+    """
+
+    def __init__(self, request: Request, budget: int) -> None:
+        self.request, self.budget = request, budget
+        self.methods = tuple(METHODS if request.variants is None else request.variants)
+        self.boards = {name: TASKS.get(name) or Board(name) for name in request.tasks or TASKS}
+        self._refuse_wrong()
+        self.left_out: dict[str, str] = {}
+        for board in self.boards.values():
+            if ":" in board.task:
+                TASK_CLASSES.register(board.task)
+        self.taken = tuple(self._taken())
+        lost = [name for name in self.boards if not any(name == task for task, _ in self.taken)]
+        if lost and (request.tasks or not self.taken):  # a task that the user named, and that no method can be run on
+            raise UserError(self.left_out[f"{lost[0]}: {self.methods[0]}"])
+
+    def _refuse_wrong(self) -> None:
+        for name in self.methods:
+            if name not in METHODS or self.methods.count(name) > 1:
+                fault = "is named twice" if name in METHODS else "is no method"
+                raise UserError(f"'{name}' {fault}; name each once: {', '.join(map(repr, METHODS))}")
+        if (self.request.algorithms or ("mappo",)) != ("mappo",):
+            raise UserError("this benchmark trains mappo alone, whose settings it tunes; leave --algo out")
+        if shared := set(self.request.seeds) & set(TRIAL_SEEDS):
+            raise UserError(f"seed {min(shared)} belongs to the trials; choose seeds that no trial has")
+        own = {name for method in self.methods for name in METHODS[method]}
+        for board in self.boards.values():
+            varied = own | {name for name in board.settings if name.startswith("task.")}
+            if wrong := next((n for n in self.request.overrides if task_setting(n, board.task) in varied), None):
+                raise UserError(f"--set {wrong} is what this study varies by itself; leave it out")
+        for task, _ in self.request.steps or ():
+            if task is not None and task not in self.boards:
+                raise UserError(f"--steps {task} concerns no run of this study; its tasks are {', '.join(self.boards)}")
+
+    def _taken(self) -> Iterator[tuple[str, str]]:
+        for name in self.boards:
+            for method in self.methods:
+                if reason := self._refusal(name, method):
+                    self.left_out[f"{name}: {method}"] = reason
+                else:
+                    yield name, method
+
+    def _refusal(self, name: str, method: str) -> str:
+        try:
+            build_learner(self.config(name, method, 0, trial=True).of_one_seed())
+        except UserError as error:
+            return str(error)
+        return ""
+
+    def steps(self, name: str, trial: bool) -> int:
+        """Return the steps per seed of a trial on a task or of the runs that judge, in their usual ratio."""
+        board, asked = self.boards[name], self.request.steps or ()
+        own = [steps for task, steps in asked if task == name] or [steps for task, steps in asked if task is None]
+        if len(own) > 1:
+            raise UserError(f"--steps gives {name} several numbers; this study takes one for each task")
+        steps = own[0] if own else board.steps
+        return max(1, steps * board.trial_steps // board.steps) if trial else steps
+
+    def config(self, name: str, method: str, draw: int, trial: bool) -> RunConfig:
+        """Return the run of a method on a task with the settings of a draw."""
+        board, request = self.boards[name], self.request
+        preset = board.preset if request.preset == "default" else request.preset
+        networks = dict(zip((PERCEPTRON, HOMOMORPHIC), board.networks, strict=True))
+        own = {key: networks.get(str(value), value) for key, value in METHODS[method].items()}
+        given = {
+            task_setting(key, board.task): value
+            for key, value in request.overrides.items()
+            if concerns(key, board.task, "mappo")
+        }
+        idle = {f"prior.{key}" for key in of_no_use_to(str(own["prior.kind"]))}
+        idle |= (_OF_NETWORKS.keys() - own.keys()) | given.keys() | (frozenset() if board.batches else _OF_BATCHES)
+        drawn = {key: value for key, value in draws(self.budget)[draw].items() if key not in idle}
+        steps, seeds = self.steps(name, trial), TRIAL_SEEDS if trial else request.seeds
+        settings = {**board.settings, **own, **drawn, **given}
+        return planned(resolve_config(board.task, "mappo", preset, steps, seeds, request.device, settings))
+
+    def _cell(self, name: str, method: str, draw: int, trial: bool) -> Cell:
+        first = next(other for task, other in self.taken if task == name)
+        stem = f"{file_name(name)}-{format_exactly(self.steps(name, trial=False))}"
+        own = f"{stem}-{file_name(method)}"
+        return Cell(
+            name=f"{own}-{draw}" if trial else own,
+            panel=f"{name}, {format_exactly(self.steps(name, trial))}",
+            variant=f"{method}, draw {draw}" if trial else method,
+            config=self.config(name, method, draw, trial),
+            reference=None if trial or method == first else f"{stem}-{file_name(first)}",
+        )
+
+    def _study(self, kind: str, title: str, cells: tuple[Cell, ...]) -> Study:
+        same = {"command": self.request.command, "episodes": self.request.episodes, "left_out": self.left_out}
+        return Study(kind=kind, title=title, rows="variants", cells=cells, **same)
+
+    def trials(self) -> Study:
+        """Plan the trials of all methods on all tasks."""
+        cells = [self._cell(*pair, draw, trial=True) for pair in self.taken for draw in range(self.budget)]
+        return self._study("symmetry-trials", "Trials of the benchmark of symmetry", tuple(cells))
+
+    def judged(self, trials: Trials) -> Study:
+        """Plan the runs that judge, with the settings of each method's best trial, the first of equal ones.
+
+        `trials.json` in the folder holds the draws and the scores.
+        """
+        cells, scores, size = [], dict[str, list[float | None]](), self.budget
+        of_trials = [score(trials.run_path(cell)) for cell in self.trials().cells]
+        for k, (name, method) in enumerate(self.taken):
+            own = of_trials[k * size : (k + 1) * size]
+            scores[f"{name}: {method}"] = [value if math.isfinite(value) else None for value in own]
+            cells.append(self._cell(name, method, int(np.argmax(own)), trial=False))
+        document = {"draws": draws(size), "seeds": TRIAL_SEEDS, "scores": scores}
+        replace_file(trials.path / "trials.json", (json.dumps(document, indent=1) + "\n").encode())
+        title = "Symmetry in multi-agent learning, each method tuned on equal steps"
+        return self._study("symmetry", title, tuple(cells))

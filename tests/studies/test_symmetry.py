@@ -1,0 +1,173 @@
+"""The benchmark of symmetry: its protocol, its methods and tasks, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from esp_cli.reporting.collect import collect_study
+from esp_cli.reporting.page import answer
+from esp_cli.reporting.results import summarised
+from esp_cli.reporting.tables import TABLES
+from esp_cli.studies.catalogue import Request
+from esp_cli.studies.run_set import StudyError
+from esp_cli.studies.study import StudyFolder
+from esp_cli.studies.symmetry import METHODS, TASKS, TRIAL_SEEDS, Benchmark, Trials, draws, score
+from esp_envs import make
+from tests.studies.small_studies import write_run
+from tests.training.runs import TINY
+
+MEASURED = Path(__file__).parents[2] / "docs" / "measured" / "sets-orders-3.json"
+
+
+def benchmark(budget: int = 3, **choice: Any) -> Benchmark:
+    """A small benchmark of two methods on navigation."""
+    defaults = {"tasks": ("navigation",), "variants": ("plain", "ESP"), "seeds": (0, 1, 2, 3), "episodes": 4}
+    return Benchmark(Request(**(defaults | choice)), budget)
+
+
+def write_trials(path: Path, asked: Benchmark, ends: dict[str, float]) -> Trials:
+    """Write trials whose last evaluation is the one by name, 0 for those without."""
+    folder = Trials.create(path, asked.trials())
+    for cell in folder.study.cells:
+        run, end = folder.prepare(cell), ends.get(cell.name, 0.0)
+        rows = ({"step": k, "eval/return_greedy": [value] * 3} for k, value in enumerate((9.0, end, end)))
+        run.metrics_path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+        run.policy_path.write_bytes(b"weights")
+    return folder
+
+
+def test_the_draws_are_those_of_the_comparison_on_file() -> None:
+    """So its protocol is that of docs/many-agents.md; the weight of relaxation, which that has not, comes after."""
+    ours = [{name: value for name, value in one.items() if name != "network.relax"} for one in draws(5)]
+    assert ours == json.loads(MEASURED.read_text())["draws"]
+    assert draws(2) == draws(5)[:2]
+    assert {one["network.relax"] for one in draws(20)[1:]} == {0.1, 0.3, 1.0, 3.0}
+
+
+def test_the_score_is_the_mean_of_the_last_two_evaluations(tmp_path: Path) -> None:
+    rows = [[-90.0, -90.0], [-30.0, -10.0], [-20.0, -40.0]]  # (-30 - 10 - 20 - 40) / 4 = -25
+    file = tmp_path / "metrics.jsonl"
+    file.write_text("".join(json.dumps({"step": k, "eval/return_greedy": row}) + "\n" for k, row in enumerate(rows)))
+    assert score(tmp_path) == -25.0
+    file.write_text(json.dumps({"step": 0, "eval/return_greedy": [-1.0, None]}) + "\n")
+    assert score(tmp_path) == -math.inf
+
+
+def test_a_trial_has_its_own_seeds_and_fewer_steps_and_only_what_counts_is_drawn() -> None:
+    asked = benchmark(overrides={"mappo.num_epochs": 7})
+    first, second = (asked.config("navigation", "plain", draw, trial=True) for draw in (0, 1))
+    assert (first.seeds, first.steps, first.preset) == (TRIAL_SEEDS, 60_000, "fast")
+    assert (second.algorithm_settings["learning_rate"], second.algorithm_settings["num_epochs"]) == (0.008, 7)
+    judged = asked.config("navigation", "ESP", 1, trial=False)
+    assert (judged.seeds, judged.steps, judged.prior.consistency_coef) == ((0, 1, 2, 3), 200_000, 0.3)
+    assert second.prior == first.prior, "nothing of a prior is drawn where there is none"
+    shorter = benchmark(steps=((None, 1000),))
+    assert shorter.config("navigation", "plain", 0, trial=True).steps == 300
+    pictures = benchmark(tasks=("wildlife",), variants=("plain", "homomorphic network"))
+    assert [pictures.config("wildlife", method, 1, True).network.name for method in pictures.methods] == ["mpn", "empn"]
+    settings = pictures.config("wildlife", "plain", 1, trial=True).algorithm_settings
+    assert (settings["num_envs"], settings["gamma"]) == (64, 0.99), "batch and horizon stay the preset's there"
+
+
+@pytest.mark.parametrize("task", ["navigation", "predator-prey"])
+@pytest.mark.parametrize(
+    ("way", "left"), [("subgroup", "c4"), ("feature", "flip-x"), ("region", "flip-x"), ("approximately", "flip-x")]
+)
+def test_a_broken_task_has_less_symmetry_and_differs_in_one_setting(task: str, way: str, left: str) -> None:
+    board = TASKS[f"{task}-{way}"]
+    settings = {name.removeprefix("task."): value for name, value in board.settings.items()}
+    assert (board.task, len(settings)) == (task, 1)
+    whole, broken = (make(task, 1, (0,), chosen).spec.symmetry.split("*")[0] for chosen in ({}, settings))
+    assert (whole, broken) == ("d4", left)
+
+
+def test_what_a_task_cannot_take_is_left_out_with_a_reason_and_the_first_taken_is_the_reference(
+    tmp_path: Path,
+) -> None:
+    asked = benchmark(tasks=("wildlife",), variants=("local frames", "plain", "frame averages"), budget=1)
+    assert asked.taken == (("wildlife", "plain"), ("wildlife", "frame averages"))
+    reason = asked.left_out["wildlife: local frames"]
+    assert reason == "network.symmetrise=local-d4 is for networks without memory and messages; use d4"
+    study = asked.judged(write_trials(tmp_path / "s", asked, {}))
+    assert [cell.reference for cell in study.cells] == [None, "wildlife-200k-plain"]
+    folder = StudyFolder.create(tmp_path / "s" / "fresh", study)
+    found = TABLES["left-out"](collect_study(folder).results)
+    assert found.rows == (("wildlife", "local frames", reason),)
+
+
+def test_every_method_is_taken_somewhere() -> None:
+    assert {method for _, method in benchmark(variants=None, budget=1).taken} == set(METHODS)
+
+
+def test_the_best_trial_is_judged_and_the_first_of_equal_ones(tmp_path: Path) -> None:
+    asked = benchmark()
+    ends = {"navigation-200k-plain-2": 5.0, "navigation-200k-esp-0": -1.0}
+    plain, esp = asked.judged(write_trials(tmp_path / "s", asked, ends)).cells
+    assert plain.config == asked.config("navigation", "plain", 2, trial=False)
+    assert esp.config == asked.config("navigation", "ESP", 1, trial=False)
+    assert json.loads((tmp_path / "s" / "trials.json").read_text())["scores"] == {
+        "navigation: plain": [0.0, 0.0, 5.0],
+        "navigation: ESP": [-1.0, 0.0, 0.0],
+    }
+
+
+def test_what_is_judged_gets_no_further_trials_but_other_methods_do(tmp_path: Path) -> None:
+    asked = benchmark()
+    judged = asked.judged(write_trials(tmp_path / "s", asked, {}))
+    Trials.create(tmp_path / "s", benchmark(budget=4, variants=("plain",)).trials())
+    StudyFolder.create(tmp_path / "s" / "fresh", judged)
+    with pytest.raises(StudyError, match="has judged navigation-200k-esp already; keep its --budget"):
+        Trials.create(tmp_path / "s", benchmark(budget=4).trials())
+    assert len(Trials.create(tmp_path / "s", benchmark(variants=("copies",)).trials()).study.cells) == 6 + 1 + 3
+
+
+@pytest.mark.parametrize(
+    ("choice", "sentence"),
+    [
+        ({"variants": ("plain", "magic")}, "'magic' is no method; name each once: 'plain', 'ESP', "),
+        ({"variants": ("plain", "plain")}, "'plain' is named twice"),
+        ({"algorithms": ("qmix",)}, "this benchmark trains mappo alone"),
+        ({"seeds": (0, 101)}, "seed 101 belongs to the trials"),
+        ({"overrides": {"prior.kind": "esp"}}, "--set prior.kind is what this study varies by itself"),
+        (
+            {"tasks": ("navigation-8",), "overrides": {"navigation.num_agents": 4}},
+            "--set navigation.num_agents is what this study varies",
+        ),
+        ({"overrides": {"mappo.lr": 1}}, "unknown setting 'mappo.lr'"),
+        ({"tasks": ("navigation", "chess")}, "unknown task 'chess'"),
+        ({"steps": (("formation", 1000),)}, "--steps formation concerns no run of this study"),
+        ({"steps": ((None, 100), (None, 200))}, "--steps gives navigation several numbers"),
+    ],
+)
+def test_what_cannot_be_run_is_refused(choice: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        benchmark(**choice)
+
+
+def test_the_report_corrects_for_the_number_of_methods(tmp_path: Path) -> None:
+    """Four seeds against four that are all lower have p = 2 / 70; with a second comparison, Holm doubles it."""
+    asked = benchmark(variants=("plain", "ESP", "copies"), overrides=TINY | {"evaluation.every_steps": 10}, budget=1)
+    folder = StudyFolder.create(tmp_path / "fresh", asked.judged(write_trials(tmp_path / "s", asked, {})))
+    for cell, end in zip(folder.study.cells, (-180.0, -150.0, -179.5), strict=True):
+        finals = [end + k for k in range(4)]
+        write_run(folder, cell, [[-200.0] * 4, finals], finals)
+    material = collect_study(folder)
+    _, esp, copies = (cell.summary for cell in material.results.cells)
+    assert esp.gap.holm == pytest.approx(2 * 2 / 70)
+    assert copies.gap.holm > 0.5
+    assert (esp.gap.ahead, copies.gap.ahead) == ("level", "level")
+    assert esp.normalised_area.mean == pytest.approx((-200 - 148.5) / 2 / 100 + 2)  # 0 is -200, 1 is -100
+    assert answer(material) == [
+        "navigation, 200k: ESP has the highest IQM, -148.50; after Holm's correction, not told apart from plain: ESP, "
+        "copies."
+    ]
+    table = TABLES["comparison"](material.results)
+    row = dict(zip(table.headings, table.rows[1], strict=True))
+    assert (row["over all pairs>"], row["p, corrected>"]) == ("1.00", "0.057")
+    alone = material.results.model_copy(update={"cells": material.results.cells[:2]})
+    assert summarised(alone).cells[1].summary.gap.ahead == "ahead", "2 / 70 is below 5 %"
