@@ -1,4 +1,6 @@
-"""Does a recurrent policy of rsl_rl learn faster with mirrored histories? `python docs/rsl_rl_recall.py` says.
+"""Does a recurrent policy of rsl_rl learn faster with mirrored histories?
+
+    python docs/rsl_rl_recall.py  # writes docs/measured/rsl-rl-recall.json
 
 A body of two joints sees a cue in the first of 8 steps, and is paid in the last 4 for joints at a function of it. The
 mirror changes the cue's sign and exchanges the joints with a sign. Needs rsl-rl-lib.
@@ -7,6 +9,7 @@ mirror changes the cue's sign and exchanges the joints with a sign. Needs rsl-rl
 from __future__ import annotations
 
 import json
+from importlib.metadata import version
 from pathlib import Path
 from types import ModuleType
 
@@ -20,6 +23,7 @@ from esp_cli import Body, Field, Kind, layout
 from esp_cli.bodies.emitting import mirror_of
 from esp_cli.loop.rsl_rl import MirroredPPO
 
+RECORD = Path(__file__).parent / "measured" / "rsl-rl-recall.json"
 ENVS, STEPS, HORIZON, UPDATES, SEEDS = 16, 24, 8, 80, 5
 GROUPS = {"actor": ["policy"], "critic": ["policy"]}
 SETTINGS = {"num_learning_epochs": 4, "num_mini_batches": 2, "learning_rate": 1e-3, "entropy_coef": 0.002}
@@ -84,13 +88,15 @@ def returns(mirror: ModuleType | None, seed: int) -> list[float]:
 
 
 def main() -> None:
-    """Print the mean return of the last ten rollouts, and of rollouts 11 to 20, by seed."""
+    """Write the mean return of the last ten rollouts, and of rollouts 11 to 20, by seed."""
     found = {}
     for name, mirror in (("plain", None), ("mirrored", recall_mirror())):
         curves = [returns(mirror, seed) for seed in range(SEEDS)]
         found[name] = {"early": [sum(c[10:20]) / 10 for c in curves], "late": [sum(c[-10:]) / 10 for c in curves]}
         print(name, {when: [round(x, 3) for x in values] for when, values in found[name].items()}, flush=True)
-    Path("recall.json").write_text(json.dumps(found), encoding="utf-8")
+    sizes = {"envs": ENVS, "steps": STEPS, "updates": UPDATES, "seeds": SEEDS}
+    written = {"command": "python docs/rsl_rl_recall.py", "rsl-rl-lib": version("rsl-rl-lib"), **sizes, **found}
+    RECORD.write_text(json.dumps(written, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -32,7 +32,6 @@ MADE = ("atlas.md", "robot-models.md", "dependencies.md")
 PAGES = [ROOT / "README.md", *(page for page in sorted((ROOT / "docs").rglob("*.md")) if page.name not in MADE)]
 OF_RULES = [page for page in PAGES if page.parent.name == "docs" and page.name not in ("index.md", "gallery.md")]
 OPEN = {
-    "docs/legged-robots.md": 10,
     "docs/many-agents.md": 9,
     "docs/measurements/replay.md": 33,
     "docs/measurements/speed.md": 13,
@@ -204,6 +203,12 @@ def test_the_atlas_has_the_rows_that_its_file_gives() -> None:
     atlas = runpy.run_path(str(ROOT / "tests" / "benchmarks" / "atlas.py"))
     kept, made = ((ROOT / "docs" / "atlas.md").read_text(encoding="utf-8"), atlas["page"](rows))
     assert sorted(kept.splitlines()) == sorted(made.splitlines())
+
+
+def test_robot_models_are_those_of_its_file() -> None:
+    record = json.loads((ROOT / "docs" / "measured" / "robot-models.json").read_text(encoding="utf-8"))
+    robots = runpy.run_path(str(ROOT / "docs" / "make_robots.py"))
+    assert robots["page"](record) == (ROOT / "docs" / "robot-models.md").read_text(encoding="utf-8")
 
 
 def test_a_number_without_a_file_and_a_changed_digit_are_noticed() -> None:

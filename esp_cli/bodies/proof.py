@@ -6,7 +6,7 @@ its own control: planted mistakes (the sign of a joint pair, a joint that stays 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,9 +22,13 @@ EXACT, NEARLY = 1e-5, 0.05
 """Largest gap of a mirror that is exact up to rounding, and of one that holds but for a model's small asymmetry."""
 SEEN = 3.0
 """How many times the gap of a planted mistake exceeds the gap without it, where the proof would have seen it."""
+NO_MIRROR = (mujoco.mjtSensor.mjSENS_USER, mujoco.mjtSensor.mjSENS_PLUGIN)
+"""Kinds of sensors of which nobody knows what their readings mean."""
 _STATES, _LYING, _PLANTED = 48, 24, 12
 """States that are compared, those that are laid on the floor, and those for each planted mistake."""
-_NO_CONSTRAINTS, _NO_CONTACTS = int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT), int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+_NO_CONSTRAINTS, _NO_SENSORS, _NO_CONTACTS = (
+    int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in ("CONSTRAINT", "SENSOR", "CONTACT")
+)
 _NO_LIMITS = int(mujoco.mjtDisableBit.mjDSBL_LIMIT | mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS) | _NO_CONTACTS
 Sample = tuple[Floats, Floats, Floats, Floats]
 """qpos, qvel, ctrl and forces on the degrees of freedom."""
@@ -41,9 +45,10 @@ class Proof:
         median: of the states' gaps: |difference| / |accelerations|.
         constraints: the same median with limits, friction and equalities.
         contacts: the same median where the robot lies on a floor; None where it cannot move freely, or touches none.
-        sensors: the largest gap of a sensor's readings, mirrored, from those of the sensor of its kind that fits best,
-            without constraints; None where none shows anything then. Attitudes are left out; the verdict leaves it out.
-        sensor: the name of that sensor.
+        sensors: by name, the gap of a sensor's readings, turned as fits best, from those of its image, the sensor of
+            its kind that fits best: a share of their own spread, without constraints.
+        unjudged: kinds of sensors that are not compared: they show nothing without constraints, as those of touch, or
+            attitudes, or are of `NO_MIRROR`.
     """
 
     joints: Floats
@@ -51,8 +56,8 @@ class Proof:
     median: float
     constraints: float
     contacts: float | None
-    sensors: float | None
-    sensor: str
+    sensors: Mapping[str, float]
+    unjudged: tuple[str, ...]
 
     @property
     def gap(self) -> float:
@@ -60,16 +65,24 @@ class Proof:
         return float(self.joints.max(initial=0))
 
     @property
+    def broken_sensors(self) -> list[str]:
+        """Sensors that no sensor is the image of, the worst first."""
+        return sorted((name for name, gap in self.sensors.items() if gap > NEARLY), key=lambda n: -self.sensors[n])
+
+    @property
     def verdict(self) -> str:
-        """Whether the mirror is "exact", "nearly" right, or "broken"."""
-        most = max(self.gap, self.constraints, self.contacts or 0.0)
-        return "exact" if most <= EXACT else "nearly" if self.gap <= NEARLY else "broken"
+        """Whether the mirror is "exact", "nearly" right, right but for "broken sensors", or "broken"."""
+        if not self.gap <= NEARLY:  # nor NaN
+            return "broken"
+        most = max(self.gap, self.constraints, self.contacts or 0.0, *self.sensors.values())
+        return "broken sensors" if self.broken_sensors else "exact" if most <= EXACT else "nearly"
 
     @property
     def summary(self) -> dict[str, Any]:
         """The verdict and all gaps, as JSON takes them."""
-        names = ("gap", "median", "constraints", "contacts", "sensors")
-        gaps = {name: getattr(self, name) for name in names}
+        gaps = {
+            name: getattr(self, name) for name in ("gap", "median", "constraints", "contacts", "sensors", "unjudged")
+        }
         return {"verdict": self.verdict, **gaps, "smallest_planted": float(self.planted.min())}
 
     def would_show(self, planted: float) -> bool:
@@ -78,7 +91,8 @@ class Proof:
 
     def __str__(self) -> str:
         contact = "" if self.contacts is None else f", in contact to {self.contacts:.2g}"
-        contact += "" if self.sensors is None else f", sensors to {self.sensors:.2g} ({self.sensor})"
+        if worst := max(self.sensors, key=self.sensors.__getitem__, default=None):
+            contact += f", sensors to {self.sensors[worst]:.2g} ({worst})"
         return (
             f"accelerations agree to {self.gap:.2g} at the worst joint, {self.median:.2g} in the median, with limits "
             f"and friction to {self.constraints:.2g}{contact}; the least planted mistake is off by "
@@ -98,24 +112,24 @@ def prove(frame: Frame, match: Match, seed: int = 0) -> Proof:
     here, there = (_accelerations(frame, data, states, _NO_CONSTRAINTS) for states in (samples, images))
 
     def mistaken(wrong: Match) -> float:
-        seen = _accelerations(frame, data, _images(wrong, samples[:_PLANTED]), _NO_CONSTRAINTS)
+        seen = _accelerations(frame, data, _images(wrong, samples[:_PLANTED]), _NO_CONSTRAINTS | _NO_SENSORS)
         return float(_gaps(frame, wrong, here[:_PLANTED], seen)[0].max())
 
     joints, median = _gaps(frame, match, here, there)
     if frame.model.neq:
-        joined, tied = (_accelerations(frame, data, states, _NO_LIMITS) for states in (samples, images))
+        joined, tied = (_accelerations(frame, data, states, _NO_LIMITS | _NO_SENSORS) for states in (samples, images))
         joints = np.maximum(joints, _gaps(frame, match, joined, tied)[0])
     planted = [min(mistaken(wrong) for wrong in _mistakes(frame, match, joint)) for joint in range(frame.model.njnt)]
     lowered = [_lowered(frame, data, sample) for sample in samples[:_LYING]]
     lying = [sample for sample in lowered if sample is not None]
     pairs = [
-        [_accelerations(frame, data, states, flag) for states in (some, moved)]
+        [_accelerations(frame, data, states, flag | _NO_SENSORS) for states in (some, moved)]
         for some, moved, flag in ((samples, images, _NO_CONTACTS), (lying, _images(match, lying), 0))
         if some
     ]
     medians = [_gaps(frame, match, *pair)[1] for pair in pairs]
-    sensors, sensor = max(_sensors(frame.model, here, there), default=(None, ""))
-    return Proof(joints, np.array(planted), median, medians[0], medians[1] if lying else None, sensors, sensor)
+    sensors = _sensors(frame.model, here, there)
+    return Proof(joints, np.array(planted), median, medians[0], medians[1] if lying else None, *sensors)
 
 
 def _state(frame: Frame, data: Any, rng: np.random.Generator) -> Sample:
@@ -178,23 +192,26 @@ def _gaps(frame: Frame, match: Match, here: Floats, there: Floats) -> tuple[Floa
     return joints, float(np.median(np.sqrt(wrong.sum(1) / np.maximum(size.sum(1), 1e-24))))
 
 
-def _sensors(model: Any, here: Floats, there: Floats) -> list[tuple[float, str]]:
-    """Return the gap and name of each sensor that shows something; see `Proof`."""
-    seen: dict[tuple[int, int], list[tuple[Floats, Floats, str]]] = {}
+def _sensors(model: Any, here: Floats, there: Floats) -> tuple[dict[str, float], tuple[str, ...]]:
+    """Return the gap of each sensor by its name, and the kinds of sensors that are not judged; see `Proof`."""
+    alike: dict[tuple[int, int], list[int]] = {}
     for s, (kind, width) in enumerate(zip(model.sensor_type.tolist(), model.sensor_dim.tolist(), strict=True)):
-        start = model.nv + model.sensor_adr[s]
-        if width in (1, 3):  # readings are compared up to where their zero is
-            own, other = (x[:, start : start + width] - x[:, start : start + width].mean(0) for x in (here, there))
-            seen.setdefault((kind, width), []).append((own, other, printable(model.sensor(s).name or f"sensor {s}")))
-    found = []
-    for like in seen.values():
-        for own, _, name in like:
-            size, gaps = np.linalg.norm(own), []
-            for _, other, _ in like if size > 1e-9 else []:
-                u, _, v = np.linalg.svd(own.T @ other)
-                gaps.append(np.linalg.norm(own @ (u @ v) - other) / size)
-            found += [(float(min(gaps)), name)] if gaps else []
-    return found
+        alike.setdefault((kind, width), []).append(s)
+    found, unjudged = dict[str, float](), set[str]()
+    for (kind, width), some in alike.items():
+        index = model.nv + model.sensor_adr[some][:, None] + np.arange(width)
+        # readings [sensors, states, width] are compared up to where their zero is
+        own, other = (np.moveaxis(x[:, index] - x[:, index].mean(0), 0, 1) for x in (here, there))
+        size, there_size = (np.square(x).sum((1, 2)) for x in (own, other))
+        for k, s in enumerate(some):
+            if width not in (1, 3) or kind in NO_MIRROR or not size[k] > 1e-18:
+                unjudged.add(mujoco.mjtSensor(kind).name.removeprefix("mjSENS_").lower())
+                continue
+            # the turn that fits best leaves |x|^2 + |y|^2 - 2 (the sum of the singular values of x'y)
+            fit = np.linalg.svd(np.einsum("si,nsj->nij", own[k], other), compute_uv=False).sum(-1)
+            left = float((size[k] + there_size - 2 * fit).min() / size[k])
+            found[printable(model.sensor(s).name or f"sensor {s}")] = max(left, 0.0) ** 0.5
+    return found, tuple(sorted(unjudged))
 
 
 def _mistakes(frame: Frame, match: Match, joint: int) -> Iterator[Match]:

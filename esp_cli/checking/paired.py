@@ -89,7 +89,7 @@ def check_paired(
     """
     shown = make(1, [0]).spec
     worlds = max(64, min(most or _MOST_WORLDS, _NUMBERS // (shown.num_agents * shown.observation.width)))
-    visited = visit(make(worlds, [0]), watch, (until + time.monotonic()) / 2)
+    visited = visit(make(worlds, [0]), watch, (until + time.monotonic()) / 2, early=most is not None)
     if most is None:  # one step of many worlds takes less time than many steps
         states, actions = (torch.cat(part, 1) for part in zip(*visited, strict=True))
         visited = [(states, actions)]

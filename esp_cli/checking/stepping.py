@@ -27,13 +27,15 @@ _NUDGE = 1e-6
 """How far a state is moved to see what rounding does."""
 
 
-def visit(env: Environment, watch: Watch, until: float) -> list[tuple[Tensor, Tensor]]:
+def visit(env: Environment, watch: Watch, until: float, early: bool = False) -> list[tuple[Tensor, Tensor]]:
     """Return states and joint actions along episodes, half of the worlds random, half by the heuristic if any.
 
-    After `until` no more steps are taken.
+    After `until` no more steps are taken. With `early`, moments lie closer together at the beginning, so that a slow
+    simulator reaches most of them in time: 0, 1, 5, 12, 31, 74, 177, 421 of 1000 steps.
     """
-    observation = env.reset()
-    taken = {round(k * (env.spec.horizon - 1) / MOMENTS) for k in range(MOMENTS)}
+    observation, last = env.reset(), env.spec.horizon - 1
+    places = (((last + 1) ** (k / MOMENTS) - 1) if early else k * last / MOMENTS for k in range(MOMENTS))
+    taken = set(map(round, places))
     visited: list[tuple[Tensor, Tensor]] = []
     for t in range(max(taken) + 1):
         if visited and time.monotonic() > until:

@@ -24,6 +24,7 @@ EPILOG = """Examples:\n
     esp mirror robot.xml --order joints.txt --emit rsl_rl -o mirror.py\n
     esp check mirror symmetry:compute_symmetric_states robot.xml"""
 
+_SENSORS = 6  # that are named; the others are in the JSON
 _SHOWN = 4  # elements that have a column in the table; the others are in the JSON
 
 
@@ -163,14 +164,24 @@ def _print(body: Body, model: Path) -> None:
 
     called = {name: name for name in (*body.found, *body.refused)}
     called |= {plain: f"{plain} ({word})" for word, plain in BODY_NAMES.items() if plain in called}
-    nearly = [name for name, one in body.found.items() if one.proof.verdict != "exact"]
-    rest = "exactly" if not nearly else f"but for asymmetries of the model itself ({', '.join(nearly)})"
+    nearly, blind = (
+        ", ".join(name for name, one in body.found.items() if one.proof.verdict == verdict)
+        for verdict in ("nearly", "broken sensors")
+    )
+    rest = f"but for asymmetries of the model itself ({nearly})" if nearly else "exactly" if not blind else ""
+    rest += f"{' and ' if nearly else ''}but for its sensors ({blind})" if blind else ""
     holds = f"is symmetric under {body.group}, {rest}; {len(body.joints)} joints"
     console.say(f"{model.name} {holds if body.found else 'has no mirror or turn that its accelerations show'}")
     for name, one in body.found.items():
         console.say(f"{called[name]}: {one.proof}")
         if one.base is not None and _differs(one.base):
             console.say(f"  the base differs from its image: {_differs(one.base)}")
+        if lost := [f"{sensor} ({one.proof.sensors[sensor]:.2g})" for sensor in one.proof.broken_sensors]:
+            more = f" and {len(lost) - _SENSORS} more" if len(lost) > _SENSORS else ""
+            told = ", ".join(lost[:_SENSORS]) + more
+            console.say(f"  no sensor is the image of {told}; in brackets, how far off, as a share of its spread")
+        if one.proof.unjudged:
+            console.say(f"  not judged: sensors of the kinds {', '.join(one.proof.unjudged)}")
         if unseen := [joint for joint, _, _, _, planted, _ in body.rows(name) if not one.proof.would_show(planted)]:
             console.say(f"  not covered: a mistake at {', '.join(unseen)} would not show in accelerations")
     for name, reason in body.refused.items():

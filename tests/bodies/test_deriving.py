@@ -15,7 +15,7 @@ from esp_cli import Body, layout
 from esp_cli.bodies.deriving import derive
 from esp_cli.bodies.frame import Frame
 from esp_cli.bodies.numbers import map_of
-from esp_cli.bodies.proof import prove
+from esp_cli.bodies.proof import Proof, prove
 from esp_cli.symmetry.plane import PlaneElement
 from esp_envs.errors import UserError
 from tests.bodies.models import BIPED_JOINTS, QUADRUPED, biped, legged
@@ -231,17 +231,41 @@ def test_a_search_ends_in_time_and_says_what_it_did_not_reach() -> None:
     assert set(body.refused.values()) == {"not covered: the 0 s for the search were over"}
 
 
-@pytest.mark.parametrize(("feet", "worst"), [(("left", "right"), 1e-9), (("left",), None)])
-def test_sensors_are_proven_too(feet, worst):
-    told = "".join(f'<jointpos joint="{foot}_knee"/><actuatorfrc actuator="a_{foot}_knee"/>' for foot in feet)
-    text = biped().replace(
-        "</mujoco>", f'<sensor>{told}<subtreecom body="chest"/><subtreelinvel body="chest"/></sensor></mujoco>'
-    )
-    proof = Body.from_mjcf(mujoco.MjModel.from_xml_string(text)).found["flip-x"].proof
-    if worst is None:
-        assert proof.sensors > 0.5
-        assert proof.sensor in ("sensor 0", "sensor 1"), "a knee has a sensor, its image none"
-    else:
-        assert proof.sensors < worst
-        assert "sensors to" in str(proof)
-    assert Body.from_mjcf(mujoco.MjModel.from_xml_string(biped())).found["flip-x"].proof.sensors is None
+def with_sensors(told: str, **how: str) -> Proof:
+    text = biped(**how).replace("</mujoco>", f"<sensor>{told}</sensor></mujoco>")
+    return body_of(text).found["flip-x"].proof
+
+
+def test_sensors_that_have_their_images_are_judged_right() -> None:
+    """A gyro in a foot that is turned by 40 degrees, too: some turn makes its readings those of its image."""
+    site = '<site name="imu" pos="0.05 0 0.02" euler="0 40 0"/>'
+    told = "".join(f'<jointpos joint="{x}_knee"/><actuatorfrc actuator="a_{x}_knee"/>' for x in ("left", "right"))
+    told += '<subtreecom body="chest"/><subtreelinvel body="chest"/><gyro site="imu"/><accelerometer site="imu"/>'
+    proof = with_sensors(told, extra=site)
+    assert len(proof.sensors) == 8
+    assert max(proof.sensors.values()) < 1e-6
+    assert (proof.verdict, proof.broken_sensors, proof.unjudged) == ("exact", [], ())
+    assert "sensors to" in str(proof)
+    assert not body_of(biped()).found["flip-x"].proof.sensors
+
+
+@pytest.mark.parametrize(
+    ("told", "site", "broken"),
+    [
+        ('<jointpos name="knee" joint="left_knee"/>', "", "knee"),  # and none at its image
+        ('<gyro name="fine" site="imu"/><accelerometer name="aside" site="imu"/>', "0 0.1 0.1", "aside"),
+        ('<rangefinder name="ray" site="imu"/><rangefinder name="other" site="imu"/>', "0 0.3 0.2", "ray"),
+    ],
+)
+def test_a_sensor_that_breaks_the_mirror_is_in_the_verdict(told: str, site: str, broken: str) -> None:
+    proof = with_sensors(told, extra=f'<site name="imu" pos="{site}" euler="150 0 0"/>' if site else "")
+    assert proof.verdict == "broken sensors"
+    assert broken in proof.broken_sensors
+    assert "fine" not in proof.broken_sensors
+    assert proof.gap < 1e-9, "the joints are right"
+
+
+def test_sensors_without_a_known_mirror_are_reported() -> None:
+    told = '<user name="own" dim="1" needstage="acc" objtype="body" objname="chest"/><framequat objtype="body" '
+    proof = with_sensors(told + 'objname="chest"/><touch site="imu"/>', extra='<site name="imu"/>')
+    assert (proof.verdict, proof.sensors, proof.unjudged) == ("exact", {}, ("framequat", "touch", "user"))

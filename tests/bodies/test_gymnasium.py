@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import mujoco
@@ -14,6 +15,8 @@ from esp_cli.bodies import gymnasium as robots
 from esp_cli.bodies.kinds import INERTIA, PartsKind
 from esp_cli.bodies.numbers import map_of
 from esp_cli.bodies.showing import layouts_of
+from esp_cli.checking import check_symmetry
+from esp_cli.checking.stepping import visit
 from esp_cli.symmetry.plane import KIND_MATRICES, PlaneElement
 from esp_cli.training.config import resolve_config
 from esp_envs import generators_for, make, task_class
@@ -22,7 +25,7 @@ from esp_envs.spec import Continuous, Layout
 from tests.bodies.models import biped
 from tests.cli.running import esp
 
-pytest.importorskip("gymnasium")
+gymnasium = pytest.importorskip("gymnasium")
 FLIP_X, FLIP_Y = PlaneElement(mirrored=True), PlaneElement("1/2", mirrored=True)
 
 
@@ -141,6 +144,49 @@ def test_a_team_exchanges_agents_in_the_order_that_the_model_says():
     there = env.set_state(here + 0.01)
     assert torch.allclose(there.state, here + 0.01, atol=1e-6)
     assert there.obs.shape == (1, 1, 4, env.observation.width)
+
+
+class Limping(robots.Walker2d):
+    """Pays for one leg, so that the mirror that it declares is wrong."""
+
+    def make_single(self):
+        env = super().make_single()
+        return gymnasium.wrappers.TransformReward(env, lambda paid: paid + 0.1 * env.unwrapped.data.qvel[6])
+
+
+class LimpingTeam(robots.Ant4x2):
+    """The same of a team."""
+
+    def make_one(self):
+        env = super().make_one()
+        plain = env.step
+
+        def step(actions):
+            seen, paid, *rest = plain(actions)
+            return seen, {agent: reward + 0.1 * env.data.qvel[6] for agent, reward in paid.items()}, *rest
+
+        env.step = step
+        return env
+
+
+@pytest.mark.parametrize(
+    ("sound", "wrong", "element"),
+    [(robots.Walker2d, Limping, "flip-x"), (robots.Ant4x2, LimpingTeam, "flip-x*agents-3-2-1-0")],
+)
+def test_a_check_finds_what_is_declared_and_refutes_what_is_wrong(sound, wrong, element):
+    pytest.importorskip("gymnasium_robotics")
+    reports = []
+    for cls in (sound, wrong):
+        settings = cls.Settings(workers=0, horizon=12)
+        reports.append(check_symmetry(lambda n, seeds: cls(settings, n, generators_for(seeds)), element))  # noqa: B023
+    assert [(report.broken, report.uncovered) for report in reports] == [((), ()), ((element,), ())]
+    assert {field.field for field in reports[1].elements[0].fields if field.outcome == "broken"} == {"reward"}
+
+
+def test_a_slow_simulator_is_looked_at_early():
+    env, taken = made(robots.Swimmer), []
+    visit(env, lambda t, *_: taken.append(t), math.inf, early=True)
+    assert taken[-1] == 422, "1000 ** (7 / 8) - 1, and the step from there"
 
 
 def test_states_of_bodies():
