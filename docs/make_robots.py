@@ -52,6 +52,7 @@ _LEFT = """
 """
 _REASONS = {
     " 0 degrees of freedom": "nothing moves",
+    "has no mass or inertia": "something moves and has no mass or inertia",
     "neither MJCF nor URDF": "a part that models include, or other XML",
     "Error opening file": "a file that it names is not there",
 }

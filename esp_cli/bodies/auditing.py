@@ -125,5 +125,12 @@ def _called(function: Callable[..., Any], numbers: Numbers, rows: dict[str, Tens
     if not set(known) & set(_OBS):
         results = (None, results[-1])
     given, acted = (*results, None)[:2]
-    found = {groups[0]: given} if isinstance(given, Tensor) else {} if given is None else {g: given[g] for g in groups}
+    try:
+        told = groups[:1] if isinstance(given, Tensor) else [] if given is None else groups
+        found = {group: given if isinstance(given, Tensor) else given[group] for group in told}
+    except (KeyError, IndexError, TypeError, RuntimeError):
+        found = {"": None}
+    if not all(isinstance(made, Tensor) for made in found.values()):
+        expected = f"a tensor, or tensors by group ({', '.join(groups)})"
+        raise UserError(f"the function returns {type(given).__name__} as observations; return {expected}")
     return found | ({ACTION: acted} if isinstance(acted, Tensor) else {})

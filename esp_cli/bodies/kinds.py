@@ -175,16 +175,19 @@ class Parts:
         if unknown := next((n for n in names if n not in self.places), None):
             known = ", ".join(map(printable, list(self.places)[:8])) + (", ..." if len(self.places) > 8 else "")
             raise UserError(f"field '{name}': there is no {printable(unknown)} among the {self.what} {known}")
-        if len(set(names)) < len(names):
-            raise UserError(f"field '{name}' names one of the {self.what} twice")
+        if twice := next((n for k, n in enumerate(names) if n in names[:k]), None):
+            raise UserError(f"field '{name}' names {printable(twice)} twice; name it once")
         spans = [np.r_[self.places[n]] for n in names]
         owner = [printable(n) for n, span in zip(names, spans, strict=True) for _ in span]
         index, moves = np.concatenate(spans) if spans else np.zeros(0, int), {}
         for element, matrix in self.moves.items():
             block = matrix[np.ix_(index, index)]
             if not np.allclose(block.T @ block, np.eye(len(index)), atol=1e-6):
-                lost = owner[int(np.abs(block).sum(0).argmin())]
-                raise UserError(f"field '{name}': the image of {lost} under {element.name} is not among them")
+                k = int(np.abs(block).sum(0).argmin())
+                rows = np.flatnonzero(matrix[:, index[k]])  # none where it has no image at all
+                images = [printable(n) for n, span in self.places.items() if set(np.r_[span]) & set(rows)]
+                missing = f", {images[0]}, is not among them; add it" if images else " is not among them"
+                raise UserError(f"field '{name}': the image of {owner[k]} under {element.name}{missing}")
             moves[element] = np.kron(block, np.eye(width)).astype(np.float64)
         return parts_field(name, self.what, [part for part in owner for _ in range(width)], moves, history)
 

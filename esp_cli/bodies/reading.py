@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -62,6 +63,9 @@ def read_model(path: Path | str, root: Path | str | None = None, floating: bool 
             return spec.compile()
         except (ValueError, mujoco.FatalError, mujoco.UnexpectedError) as error:
             words = " ".join(str(error).removeprefix("Error:").split()).rstrip(".")
+            if light := re.search("mjMINVAL.* name '([^']*)'", words):
+                light_one = printable(light[1]) if light[1] else "a body"
+                words = f"{light_one} moves but has no mass or inertia; give it an <inertial>"
             raise UserError(f"MuJoCo cannot read {printable(str(path))}: {words[:300]}") from None
 
 

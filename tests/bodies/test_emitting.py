@@ -199,6 +199,9 @@ def test_numbers_that_say_nothing_are_refused(body, tmp_path, monkeypatch, text,
         (lambda actions: actions[:, :2], "rows of 9 were given"),
         (lambda actions: actions.abs(), "not a linear map"),
         (lambda actions: 1 / 0, "raises ZeroDivisionError"),
+        (lambda obs, actions: 3, r"returns int as observations; return a tensor, or tensors by group \(policy\)"),
+        (lambda obs, actions: ({"policy": 3}, actions), "returns dict as observations"),
+        (lambda obs, actions: ({}, actions), "returns dict as observations"),
     ],
 )
 def test_functions_that_are_no_mirror_are_refused(body, function, words):

@@ -146,10 +146,10 @@ def test_joints_come_in_the_simulators_order():
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda b: b.positions(["left_knee"]), "the image of left_knee under flip-x is not among them"),
+        (lambda b: b.positions(["left_knee"]), "left_knee under flip-x, right_knee, is not among them; add it"),
         (lambda b: b.positions(["left_knee", "knee"]), "there is no knee among the joints waist, "),
-        (lambda b: b.positions(["waist", "waist"]), "twice"),
-        (lambda b: b.contacts(["left_foot"]), "the image of left_foot under flip-x is not among them"),
+        (lambda b: b.positions(["waist", "waist"]), "names waist twice; name it once"),
+        (lambda b: b.contacts(["left_foot"]), "left_foot under flip-x, right_foot, is not among them; add it"),
         (lambda b: b.contacts(["paw"]), "there is no paw among the limbs"),
         (lambda b: b.scan([[1, 0.5], [1, 0]]), "the image of point 0 under flip-x is no point"),
         (lambda b: b.scan([]), "points have shape"),

@@ -54,7 +54,7 @@ def sentence(path, **choice) -> str:
         ('<mujoco><asset><mesh file="pipe"/></asset></mujoco>', "no regular file"),
         ('<mujoco><asset><texture file="../pipe"/></asset></mujoco>', "outside"),
         ('<mujoco><asset><mesh file="missing.stl"/></asset></mujoco>', "cannot read"),
-        ('<mujoco><worldbody><body><joint/></body></worldbody></mujoco>', "mass and inertia"),
+        ('<mujoco><worldbody><body><joint/></body></worldbody></mujoco>', "a body moves but has no mass or inertia"),
         ('<mujoco><worldbody><body name="&#10;\'*/"><joint type="a&#10;b"/></body></worldbody></mujoco>', "keyword"),
     ],
 )  # fmt: skip
@@ -135,7 +135,7 @@ def test_a_urdf_without_inertia_is_refused(tmp_path):
     path = tmp_path / "none.urdf"
     path.write_text('<robot name="r"><link name="a"/><link name="b"/>' + JOINT.format("b", 1, "1 0 0", "")
                     .replace('parent link="base"', 'parent link="a"') + "</robot>")  # fmt: skip
-    assert "mass and inertia" in sentence(path)
+    assert ": a moves but has no mass or inertia; give it an <inertial>" in sentence(path)
 
 
 def test_odd_names_are_quoted_in_tables_and_messages(tmp_path):
