@@ -49,9 +49,9 @@ class TaskSettings(BaseModel):
         marks = {name: mark for name, mark in self.breakable().items() if getattr(self, name)}
         return {name: replace(mark, plane=getattr(self, f"{mark.plane}", mark.plane)) for name, mark in marks.items()}
 
-    def left_of(self, whole: str, *further: Breaks) -> str:
-        """Return what the settings, and further things, leave of a symmetry: "flip-x*agents", "c1" for none."""
-        broken = (*self.broken().values(), *further)
+    def left_of(self, whole: str) -> str:
+        """Return what the settings leave of a symmetry: "flip-x*agents", "c1" for none."""
+        broken = self.broken().values()
         planes = {one.plane for one in broken if one.plane is not None}
         plane, *rest = whole.split("*")
         if planes:

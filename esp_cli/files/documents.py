@@ -30,6 +30,10 @@ MAX_TABLE_BYTES = 2**20
 MAX_NESTING = 64
 _LARGEST = 1e30  # of the numbers that a setting takes; float32, in which most of them are used, ends at 3.4e38
 _MAX_INTEGER = 2**63
+_GONE: dict[str, dict[str, object]] = {
+    "predator-prey": {"prey_policy": None, "prey_policy_seed": 0, "learned_prey": 0.0},
+}
+"""Settings that earlier versions wrote into files, with their defaults: of a task, or the prior."""
 _TOO_DEEP = f"it is nested more than {MAX_NESTING} deep"
 
 
@@ -138,6 +142,16 @@ def validated(model: type[BaseModel], values: Mapping[str, object], section: str
 def _numbers(value: object) -> list[bool | int | float]:
     items = value if isinstance(value, list | tuple) else [value]
     return [item for item in items if isinstance(item, bool | int | float)]
+
+
+def without_gone(owner: str, stored: object) -> object:
+    """Return stored settings without those that went; one that is not at its old default is a UserError."""
+    gone = _GONE.get(owner, {})
+    if not isinstance(stored, Mapping) or not gone.keys() & stored.keys():
+        return stored
+    if away := [name for name in gone if stored.get(name, gone[name]) != gone[name]]:
+        raise UserError(f"this esp has no '{away[0]}' any more; use the esp that wrote it, or train without it")
+    return {name: value for name, value in stored.items() if name not in gone}
 
 
 def encode(value: object, path: str | os.PathLike[str], error: type[UserError] = DocumentError) -> bytes:

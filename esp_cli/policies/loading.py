@@ -25,13 +25,12 @@ from esp_cli.networks.policy import Policy
 from esp_cli.networks.roles import RolesPolicy
 from esp_cli.policies import bundled
 from esp_cli.training.build import build_environment, generators, spec_of
-from esp_cli.training.checkpoint import CheckpointError, read_initial, read_policy
+from esp_cli.training.checkpoint import CheckpointError, digest, read_initial, read_policy
 from esp_cli.training.config import InitialPolicy, RunConfig, resolve_task_settings
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.settings import parse_config
 from esp_envs.base import Environment
 from esp_envs.errors import UserError
-from esp_envs.mpe.frozen_prey import digest
 from esp_envs.registry import task_names
 from esp_envs.spec import TaskSpec
 from esp_envs.views import OthersAtRandom, RoleView

@@ -32,10 +32,10 @@ from esp_cli.files.opening import open_regular
 from esp_cli.files.writing import replace_file
 from esp_cli.training.config import InitialPolicy, RunConfig
 from esp_envs.errors import UserError
-from esp_envs.mpe.frozen_prey import METADATA_KEY, POLICY_FORMAT, digest
 from esp_envs.spec import TaskSpec
 
-CHECKPOINT_FORMAT = "esp-checkpoint"
+CHECKPOINT_FORMAT, POLICY_FORMAT = "esp-checkpoint", "esp-policy"
+METADATA_KEY = "esp"
 _VERSION = 1  # of both formats
 _RESERVED = {"format", "version", "sha256"}
 _MAX_HEADER_BYTES = 4 * 2**20  # parsed JSON takes some 20 times the space of its text
@@ -196,6 +196,21 @@ def _check_tensors(tensors: Mapping[str, Tensor]) -> None:
         # a bool that is neither 0 nor 1 is undefined behaviour in the code that reads it
         if tensor.dtype == torch.bool and tensor.numel() and int(tensor.view(torch.uint8).max()) > 1:
             raise CheckpointError(f"is damaged: its tensor {shortened(repr(name))} has truth values other than 0 and 1")
+
+
+def digest(tensors: Mapping[str, Tensor], description: Mapping[str, Any]) -> str:
+    """Return the SHA-256, as hex, of the description and of each tensor's name, dtype, shape and bytes by name."""
+    found = hashlib.sha256(_canonical(description))
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        found.update(_canonical([name, str(tensor.dtype), list(tensor.shape)]))
+        if tensor.numel():
+            found.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
+    return found.hexdigest()
+
+
+def _canonical(value: Any) -> bytes:
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode("ascii")
 
 
 def same(a: Tensor, b: Tensor) -> bool:

@@ -8,12 +8,12 @@ import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
-from pydantic import BaseModel, Field, field_validator
+from pydantic import BaseModel, Field, ValidationInfo, field_validator
 from pydantic_core import to_jsonable_python
 
 from esp_cli.algorithms.presets import ALGORITHMS, preset_layers
 from esp_cli.defaults import MAX_SEEDS, MAX_STEPS, STEPS
-from esp_cli.files.documents import Strict, parse_value, validated
+from esp_cli.files.documents import Strict, parse_value, validated, without_gone
 from esp_cli.files.formatting import nearest, shortened
 from esp_cli.networks.build import AnyNetworkConfig, network_class
 from esp_cli.networks.plain import MlpConfig
@@ -65,6 +65,11 @@ class RunConfig(Strict):
         if len(set(seeds)) < len(seeds):
             raise UserError("a seed stands there twice")
         return seeds
+
+    @field_validator("task_settings", "prior", mode="before")
+    @classmethod
+    def _without_what_went(cls, stored: object, info: ValidationInfo) -> object:
+        return without_gone(info.data.get("task", "") if info.field_name == "task_settings" else "prior", stored)
 
     def of_one_seed(self) -> RunConfig:
         """Return the configuration of the first seed alone, on the CPU, for what all seeds and devices share."""

@@ -33,7 +33,9 @@ from esp_cli.files.opening import holding, open_own, require_held
 from esp_cli.files.writing import TEMPORARY_PREFIX, remove_file, sync_file
 from esp_cli.training.checkpoint import (
     CHECKPOINT_FORMAT,
+    POLICY_FORMAT,
     CheckpointError,
+    digest,
     load_checkpoint,
     read_description,
     save_checkpoint,
@@ -41,7 +43,6 @@ from esp_cli.training.checkpoint import (
 )
 from esp_cli.training.folder_names import CHECKPOINTS, CONFIG, INITIAL, LOCK, METRICS, POLICY
 from esp_envs.errors import UserError
-from esp_envs.mpe.frozen_prey import POLICY_FORMAT, digest
 
 KEPT_CHECKPOINTS = 2  # so that a damaged newest one leaves another to go on from
 RUN_ID, CONFIG_SHA256 = "run_id", "config_sha256"

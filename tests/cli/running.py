@@ -13,8 +13,7 @@ from typing import Any
 from typer.testing import CliRunner, Result
 
 from esp_cli.app import app
-from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
-from esp_envs.mpe.frozen_prey import POLICY_FORMAT
+from esp_cli.training.checkpoint import POLICY_FORMAT, load_checkpoint, save_checkpoint
 from tests.training.runs import TINY
 
 TINY_OPTIONS = [part for name, value in TINY.items() for part in ("--set", f"{name}={json.dumps(value)}")]

@@ -9,10 +9,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from esp_cli.training.checkpoint import load_checkpoint
+from esp_cli.training.checkpoint import POLICY_FORMAT, load_checkpoint
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.settings import parse_config, read_config_file
-from esp_envs.mpe.frozen_prey import POLICY_FORMAT
 from tests.cli.running import STEPS, TINY_OPTIONS, esp, printed, refused, stored_config, train_tiny, written
 
 

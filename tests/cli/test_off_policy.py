@@ -86,16 +86,6 @@ def test_a_run_stopped_and_resumed_equals_one_run_through(
     assert untimed(straight) == untimed(halted)
 
 
-def test_a_learned_qmix_prey_can_be_frozen_into_the_game(tmp_path: Path) -> None:
-    prey = tmp_path / "prey"
-    esp("train", *options("qmix"), "--task", "predator-prey", "--set", "task.control=prey", "--out", prey)
-    frozen = ("--set", "task.prey=policy", "--set", f"task.prey_policy={prey / 'policy.safetensors'}")
-    esp("train", *options("maddpg"), "--task", "predator-prey", *frozen, "--out", tmp_path / "hunt")
-    config = json.loads((tmp_path / "hunt" / "config.json").read_text())
-    assert config["task_settings"]["prey"] == "policy"
-    assert (tmp_path / "hunt" / "policy.safetensors").is_file(), "the run came to its end"
-
-
 def test_what_does_not_go_together_is_refused_before_a_folder_is_made(tmp_path: Path) -> None:
     run = tmp_path / "run"
     cases = {

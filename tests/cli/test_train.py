@@ -194,7 +194,7 @@ def test_what_was_measured_before_training_is_told(tmp_path: Path, monkeypatch: 
         (["--set", "mappo.learning_rate"], "--set mappo.learning_rate is not a setting"),
         (["--set", "task.prey=still"], "unknown setting 'task.prey'"),
         (["--set", "task.num_agents=0"], "bad value 0 for 'task.num_agents'"),
-        (["--task", "predator-prey", "--set", "task.prey=policy"], "give both or neither"),
+        (["--task", "predator-prey", "--set", "task.control=both", "--set", "task.prey=still"], "leave prey out"),
     ],
 )
 def test_what_is_wrong_is_told_in_one_sentence_and_leaves_no_folder(

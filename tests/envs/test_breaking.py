@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import pytest
 import torch
@@ -13,9 +12,9 @@ from esp_cli.symmetry import Group
 from esp_cli.symmetry.admission import admitted_elements
 from esp_envs import Environment, Step, make
 from esp_envs.epuck.robot import MAX_WHEEL_SPEED
-from esp_envs.settings import Breaks, TaskSettings
+from esp_envs.mpe.navigation import NavigationSettings
+from esp_envs.settings import Breaks
 from esp_envs.spec import Spaces
-from tests.envs.test_frozen_prey import write
 
 SMALL = {"horizon": 40, "num_agents": 4, "num_obstacles": 2}
 BROKEN = [
@@ -65,25 +64,19 @@ def test_the_check_finds_the_group_that_is_declared_to_be_left(task: str, settin
     assert {"rot90", swap} <= carried(spec), "a prior may use the whole group all the same"
 
 
-@pytest.mark.parametrize("prey", [{"prey": "policy"}, {"learned_prey": 0.5, "prey": "still"}], ids=str)
-def test_a_learned_prey_leaves_nothing_that_is_declared(tmp_path: Path, prey) -> None:
-    settings = prey | {"prey_policy": write(tmp_path / "prey.safetensors"), "prey_policy_seed": 1}
-    report = check_symmetry(lambda n, seeds: make("predator-prey", n, seeds, settings), "d4")
-    assert report.declared == "c1"
-    outcomes = {element.element: element.outcome for element in report.elements}
-    assert outcomes["rot90"] == outcomes["flip-diagonal"] == "broken"
-
-
 def test_what_several_breakings_leave() -> None:
-    wind, mud, gust, weak = Breaks("flip-x"), Breaks("flip-x"), Breaks("flip-diagonal"), Breaks(None, agents=False)
-    left_of = TaskSettings().left_of
+    def left_of(whole: str, *names: str) -> str:
+        return NavigationSettings(**dict.fromkeys(names, 0.5)).left_of(whole)
+
     assert left_of("d4*agents") == "d4*agents"
-    assert left_of("o2*agents", wind, mud) == "flip-x*agents"
-    assert left_of("d4*agents", wind, gust, weak) == "c1"
-    assert left_of("d4*agents*landmarks-3", wind, weak) == "flip-x*landmarks-3"
-    assert left_of("d4", weak) == "d4"
+    assert left_of("o2*agents", "wind", "mud") == "flip-x*agents"
+    assert left_of("d4*agents", "wind", "gust_mean", "weak_agent") == "c1"
+    assert left_of("d4*agents*landmarks-3", "wind", "weak_agent") == "flip-x*landmarks-3"
+    assert left_of("d4", "weak_agent") == "d4"
     settings = make("navigation", 1, [0], {"wind": 1, "action_turn_rad": 0.5, "actions": "continuous"}).settings
-    assert settings.broken() == {"wind": wind, "action_turn_rad": Breaks("so2")}, "those that are 0 break nothing"
+    assert settings.broken() == {"wind": Breaks("flip-x"), "action_turn_rad": Breaks("so2")}, (
+        "those that are 0 break nothing"
+    )
     assert settings.broken_in_words() == ", wind 1, action_turn_rad 0.5"
 
 
@@ -174,37 +167,6 @@ def test_heuristics_know_where_forces_and_rewards_point() -> None:
     plain = missing()
     assert missing(action_turn_rad=1.5) == pytest.approx(plain, rel=0.02)
     assert missing(reward_offset=0.3) == pytest.approx(plain, rel=0.1)
-
-
-def test_a_prey_follows_its_policy_as_often_as_asked(tmp_path: Path) -> None:
-    """Seed 0 of the file always moves up; a still prey else stays."""
-    settings = {"prey": "still", "prey_policy": write(tmp_path / "prey.safetensors"), "learned_prey": 0.25}
-    env, alone = (make("predator-prey", 256, seeds, settings) for seeds in ([0, 1], [1]))
-    env.reset(), alone.reset()
-    velocity = slice(6, 8)
-    saved = env.state_dict()
-    first = idle(env).next.state[..., velocity]
-    assert float((first[..., 1] > 0.35).float().mean()) == pytest.approx(0.25, abs=0.06)
-    env.load_state_dict(saved)
-    assert torch.equal(idle(env).next.state[..., velocity], first)
-    assert torch.equal(idle(alone).next.state[0, :, velocity], first[1])
-    with pytest.raises(ValueError, match="give both or neither"):
-        make("predator-prey", 1, [0], {"learned_prey": 0.5})
-    with pytest.raises(ValueError, match="leave learned_prey out"):
-        make("predator-prey", 1, [0], settings | {"prey": "policy"})
-
-
-def test_a_prey_follows_its_policy_in_the_steps_that_were_drawn(tmp_path: Path) -> None:
-    """Up, not, up: 0.4, then 0.75 of it, then 0.75 of that and 0.4."""
-    settings = {"prey": "still", "prey_policy": write(tmp_path / "prey.safetensors"), "learned_prey": 0.5}
-    env = placed("predator-prey", [3.0, 3.0, -3.0, 3.0, 3.0, -3.0, 0.0, 0.0, 5.0, 5.0, -5.0, 5.0], **settings)
-    other = make("predator-prey", 1, [1], settings)
-    saved = env.state_dict()
-    saved["follows"][:3] = torch.tensor([True, False, True]).view(3, 1)
-    other.reset()
-    other.load_state_dict(saved)
-    speeds = [idle(other).next.state[0, 0, 7].item() for _ in range(3)]
-    assert speeds == pytest.approx([0.4, 0.3, 0.625])
 
 
 def test_gusts_are_random_per_step_axis_and_seed_and_come_back_with_the_state() -> None:

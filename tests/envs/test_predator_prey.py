@@ -155,7 +155,6 @@ def test_anchors(settings: dict[str, object], policy: str, expected: float) -> N
     "settings",
     [
         {"prey": "policy"},
-        {"prey_policy": "prey.safetensors"},
         {"control": "prey", "prey": "fleeing"},
         {"num_predators": 0},
         {"prey": "wild"},

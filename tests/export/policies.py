@@ -11,9 +11,8 @@ import torch
 from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training.build import build_environment, generators
-from esp_cli.training.checkpoint import describe_policy, save_checkpoint
+from esp_cli.training.checkpoint import POLICY_FORMAT, describe_policy, save_checkpoint
 from esp_cli.training.config import resolve_config
-from esp_envs.mpe.frozen_prey import POLICY_FORMAT
 from tests.algorithms.off_policy import on_perceptron
 
 KINDS = {

@@ -25,8 +25,7 @@ from esp_cli.policies.bundling import bundle
 from esp_cli.policies.loaded import load_policy
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training import checkpoint
-from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
-from esp_envs.mpe.frozen_prey import POLICY_FORMAT
+from esp_cli.training.checkpoint import POLICY_FORMAT, load_checkpoint, save_checkpoint
 from tests.export.policies import drawn_policy, write_policy
 
 T = TypeVar("T")

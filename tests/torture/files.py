@@ -46,7 +46,7 @@ from tests.studies.test_tuner import search
 from tests.studies.test_tuning import tuning
 from tests.torture.junk import spoil_bytes, spoil_header, spoil_json, spoil_value
 from tests.torture.limits import PROCESSOR_S, TooLongError, time_limit
-from tests.training.runs import TINY, tiny_folder
+from tests.training.runs import tiny_folder
 
 BATCH = 100
 LIMIT_BYTES = 10**9
@@ -139,7 +139,7 @@ class Files:
     def _load_originals(self) -> dict[str, Any]:
         return {
             name: load_checkpoint(self.scratch / KINDS[name].path, _format(name))
-            for name in ("policy", "checkpoint", "prey", "crowd")
+            for name in ("policy", "checkpoint", "crowd")
         }
 
     def _forge(self, name: str, path: Path, rng: random.Random) -> None:
@@ -172,16 +172,6 @@ def _make_sound_files(scratch: Path) -> None:
     folder = tiny_folder(scratch / RUN, steps=100)
     with folder.lock():
         Trainer(parse_config(folder.config, folder.path), folder).run(lambda news: True)
-    config = resolve_config("predator-prey", steps=50, overrides=TINY | {"task.control": "prey"})
-    prey = RunFolder.create(scratch / "prey", config.model_dump(mode="json"))
-    with prey.lock():
-        Trainer(config, prey).run(lambda news: True)
-    hunters = {"task.prey": "policy", "task.prey_policy": str(scratch / KINDS["prey"].path)}
-    hunt = RunFolder.create(
-        scratch / "hunt", resolve_config("predator-prey", steps=50, overrides=TINY | hunters).model_dump(mode="json")
-    )
-    with hunt.lock():
-        Trainer(parse_config(hunt.config, hunt.path), hunt).run(lambda news: True)
     study = StudyFolder.create(
         scratch / STUDY, plan("table1", request(tasks=("navigation",), seeds=(0,), steps=((None, 100),)))
     )
@@ -296,10 +286,6 @@ def _manifest(path: Path) -> str | None:
     return _document(MANIFEST_FORMAT, path, MANIFEST_FORMAT.parse(path, Manifest).model_dump(mode="json"))
 
 
-def _prey(path: Path) -> None:
-    make("predator-prey", 1, [0], {"prey": "policy", "prey_policy": str(path)})
-
-
 @functools.cache
 def _spec() -> TaskSpec:
     return make("navigation", 1, [0]).spec
@@ -348,7 +334,6 @@ _ALL = (
     (f"{STUDY}/study.json", _study, "report {scratch}/study --json -", spoil_json),
     ("evaluation/final-evaluation.json", _evaluation, "report {scratch}/study", spoil_json),
     (f"bundled/{MANIFEST}", _manifest, "policies", spoil_json),
-    ("prey/policy.safetensors", _prey, "eval {scratch}/hunt -e 2", spoil_header),
     ("transitions.npz", _transitions, "discover {scratch}/transitions.npz --task navigation", spoil_bytes),
     ("tuning/journal.jsonl", _journal, "report {scratch}/tuning", spoil_json),
     ("tuning/tuning.json", _tuning, "report {scratch}/tuning", spoil_json),
@@ -366,7 +351,6 @@ _NAMES = (
     "study",
     "evaluation",
     "manifest",
-    "prey",
     "transitions",
     "journal",
     "tuning",

@@ -9,13 +9,16 @@ import pytest
 from pydantic import Field
 
 from esp_cli.algorithms.mappo import MappoConfig
+from esp_cli.files.documents import validate
 from esp_cli.networks.constrained import EquivariantConfig
 from esp_cli.networks.message_passing import EmpnConfig, MpnConfig
 from esp_cli.networks.plain import GruConfig, MlpConfig
 from esp_cli.prior import PriorConfig
+from esp_cli.studies.run_set import Cell
 from esp_cli.training import config as config_module
 from esp_cli.training.config import EvaluationConfig, RunConfig, completed, resolve_config
 from esp_cli.training.settings import parse_config
+from esp_envs.errors import UserError
 from esp_envs.registry import task_class
 
 
@@ -63,31 +66,25 @@ def test_what_a_preset_sets_for_its_network_is_left_out_for_another_that_does_no
     [
         ("navigation", "mappo", {}, {"mappo.truncation", "task.local_ratio"}),
         ("navigation", "mappo", {"task.convention": "pettingzoo"}, {"mappo.truncation"}),
-        ("predator-prey", "mappo", {}, {"mappo.truncation", "task.prey_policy_seed"}),
-        (
-            "predator-prey",
-            "mappo",
-            {"task.prey": "policy", "task.prey_policy": "prey.safetensors"},
-            {"mappo.truncation"},
-        ),
-        ("predator-prey", "mappo", {"network.name": "gru"}, {"task.prey_policy_seed"}),
+        ("predator-prey", "mappo", {}, {"mappo.truncation"}),
+        ("predator-prey", "mappo", {"network.name": "gru"}, set()),
         ("wildlife", "mappo", {}, {"mappo.truncation", "mappo.critic_activation"}),
         ("wildlife", "mappo", {"network.name": "mlp"}, {"mappo.truncation"}),
-        ("predator-prey", "maddpg", {}, {"task.prey_policy_seed"}),
-        ("predator-prey", "maddpg", {"task.actions": "continuous"}, {"maddpg.actor_gradient", "task.prey_policy_seed"}),
+        ("predator-prey", "maddpg", {}, set()),
+        ("predator-prey", "maddpg", {"task.actions": "continuous"}, {"maddpg.actor_gradient"}),
         ("formation", "maddpg", {}, {"maddpg.actor_gradient"}),
         ("formation", "maddpg", {"task.num_obstacles": 0}, {"maddpg.actor_gradient", "task.obstacle_radius_m"}),
         (
             "predator-prey",
             "qmix",
             {"network.layer_norm": True},
-            {"network.precision", "network.compiled", "task.prey_policy_seed"},
+            {"network.precision", "network.compiled"},
         ),
         (
             "predator-prey",
             "maddpg",
             {"network.name": "gru", "network.layer_norm": True},
-            {"network.precision", "network.compiled", "task.prey_policy_seed"},
+            {"network.precision", "network.compiled"},
         ),
     ],
 )
@@ -117,6 +114,28 @@ def test_a_consistency_loss_of_the_policy_alone_is_refused_where_there_is_no_pol
 def test_the_choice_of_terms_is_named_for_a_learner_that_has_one_of_them_alone(algorithm, idle):
     config = resolve_config("navigation", algorithm, overrides={"prior.terms": "value"})
     assert ("prior.terms" in config.without_effect()) is idle
+
+
+GONE = [
+    ("task_settings", {"prey_policy": None, "prey_policy_seed": 0, "learned_prey": 0.0}, {"learned_prey": 0.5}),
+]
+"""By part of a configuration, settings that went: as earlier versions stored them, and one that they acted on."""
+
+
+@pytest.mark.parametrize(("part", "defaults", "used"), GONE)
+def test_a_setting_that_went_is_dropped_at_its_old_default_and_refused_otherwise(part, defaults, used):
+    config = resolve_config("predator-prey", "qmix")
+    stored = config.model_dump(mode="json")
+    stored[part] |= defaults
+    assert parse_config(stored, Path("run")) == config
+    other = resolve_config("navigation", "qmix").model_dump(mode="json")
+    with pytest.raises(UserError, match=r"unknown setting 'task.prey_policy'"):
+        parse_config(other | {"task_settings": other["task_settings"] | {"prey_policy": None}}, Path("run"))
+    cell = {"name": "a", "panel": "p", "variant": "v", "config": stored}
+    assert validate(Cell, cell).config == config, "so does one in a study"
+    for name, value in used.items():
+        with pytest.raises(UserError, match=f"this esp has no '{name}' any more; use the esp that wrote it"):
+            parse_config(stored | {part: stored[part] | {name: value}}, Path("run"))
 
 
 FLAT = {

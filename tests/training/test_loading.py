@@ -8,12 +8,11 @@ import pytest
 import torch
 
 from esp_cli.policies.loading import TrainedPolicy
-from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
+from esp_cli.training.checkpoint import POLICY_FORMAT, load_checkpoint, save_checkpoint
 from esp_cli.training.config import RunConfig
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.settings import parse_config
 from esp_cli.training.trainer import Trainer
-from esp_envs.mpe.frozen_prey import POLICY_FORMAT
 from tests.training.runs import tiny_config, tiny_folder
 
 

@@ -12,9 +12,8 @@ from torch import Tensor
 
 from esp_envs.base import joined
 from esp_envs.batched import World
-from esp_envs.mpe.frozen_prey import FrozenPrey
 from esp_envs.mpe.particles import Bodies
-from esp_envs.mpe.predator_prey_spec import PredatorPreySettings, predator_prey_spec, prey_layout
+from esp_envs.mpe.predator_prey_spec import PredatorPreySettings, predator_prey_spec
 from esp_envs.mpe.task import MOVES, ParticleTask, nearest_move, unit_disc
 from esp_envs.scene import COLORS, PALE, Body, Scene, look
 from esp_envs.spec import TaskSpec
@@ -70,8 +69,6 @@ class PredatorPrey(ParticleTask):
             full force in a uniform direction. All are drawn at the start of an episode: `prey_moves`.
         fleeing: runs from the nearest predator, and back to the origin when farther than 0.9 from it.
         still: exerts no force (it can be pushed).
-        policy: a frozen learned prey, read from a file. With `learned_prey` = p another prey follows that file with
-            probability p at each step, drawn at the start of an episode.
 
     Start: velocities zero, all agents uniform in [-1, 1]^2, obstacles uniform in [-0.9, 0.9]^2. Conventions differ in
     the order of integration only: `esp` updates the velocity first (original MPE), `pettingzoo` the position (mpe2).
@@ -85,11 +82,10 @@ class PredatorPrey(ParticleTask):
     the prey to its nearest predator, length).
 
     Symmetry: dynamics and reward are invariant under all rotations and reflections; discrete moves carry `d4`, forces
-    `o2`. The prey's own bounds are a square, so `control="prey"` has `d4` only. A learned prey (`policy`,
-    `learned_prey`) need not be equivariant: then nothing is declared to be left. Other settings that break the symmetry
-    leave: `wind` and `mud` the mirror `flip-x`, `gust_mean` the mirror `flip-diagonal`, `weak_agent` all but the
-    exchange of predators, `action_turn_rad` the rotations, `reward_offset` (who touches a place right of the prey is
-    rewarded) the mirror `flip-x`.
+    `o2`. The prey's own bounds are a square, so `control="prey"` has `d4` only. Settings that break the
+    symmetry leave: `wind` and `mud` the mirror `flip-x`, `gust_mean` the mirror `flip-diagonal`, `weak_agent` all but
+    the exchange of predators, `action_turn_rad` the rotations, `reward_offset` (who touches a place right of the prey
+    is rewarded) the mirror `flip-x`.
 
     Heuristics: `chase` (predators run at the prey; with `control="prey"`: the fleeing prey).
 
@@ -112,14 +108,6 @@ class PredatorPrey(ParticleTask):
         lanes, horizon = self.worlds.num_lanes, settings.horizon
         self._prey_plan = torch.zeros(horizon, 2, lanes, device=self.device)
         self.world["prey_moves"] = self._by_world(self._prey_plan)
-        if settings.learned_prey:
-            self._follows = torch.zeros(horizon, lanes, dtype=torch.bool, device=self.device)
-            self.world["follows"] = self._by_world(self._follows)
-        self._frozen: FrozenPrey | None = None
-        if settings.prey_policy is not None:
-            width = prey_layout(settings).width
-            seed = settings.prey_policy_seed
-            self._frozen = FrozenPrey(settings.prey_policy, seed, width, MOVES.count, self.device)
 
     def _describe(self) -> TaskSpec:
         return predator_prey_spec(self.settings)
@@ -181,23 +169,19 @@ class PredatorPrey(ParticleTask):
         return Scene(tuple(bodies), (-half, half, -half, half), unit="length units")
 
     def _to_save(self) -> dict[str, Tensor]:
-        follows = {"follows": self._follows} if self.settings.learned_prey else {}
-        return super()._to_save() | {"prey_moves": self.prey_moves} | follows
+        return super()._to_save() | {"prey_moves": self.prey_moves}
 
     def _chance(self, generator: torch.Generator) -> World:
-        shape, device = (self.settings.horizon, self.num_envs), self.device
-        drawn = {}
-        if share := self.settings.learned_prey:
-            drawn["follows"] = (torch.rand(shape, generator=generator, device=device) < share).t()
         if self._prey_learns or self.settings.prey != "random":
-            return drawn
+            return {}
+        shape, device = (self.settings.horizon, self.num_envs), self.device
         move = torch.randint(MOVES.count, shape, generator=generator, device=device)
         if self.settings.actions == "discrete":
             plan = self._move_control(move)
         else:
             angle = torch.rand(shape, generator=generator, device=device) * (2 * math.pi)
             plan = torch.stack([angle.cos(), angle.sin()], dim=1) * (move != 0).unsqueeze(1)
-        return drawn | {"prey_moves": plan.movedim(-1, 0)}
+        return {"prey_moves": plan.movedim(-1, 0)}
 
     def _drive(self) -> None:
         predators = self.settings.num_predators
@@ -209,13 +193,8 @@ class PredatorPrey(ParticleTask):
             self._control[predators] = self._prey_plan[self._time]
         elif self.settings.prey == "fleeing":
             self._control[predators:] = self._as_control(self._flight())
-        elif self.settings.prey == "still":
+        else:
             self._control[predators:] = 0.0
-        if self._frozen is not None:
-            moves = self._frozen.moves(self._prey_sees(self._split(self.worlds.rows().t())))
-            learned, control = self._move_control(moves.unsqueeze(0)), self._control[predators:, :, : len(moves)]
-            follows = self._follows[self._time, : len(moves)] if self.settings.learned_prey else None
-            control.copy_(learned if follows is None else torch.where(follows, learned, control))
 
     def _as_control(self, wish: Tensor) -> Tensor:
         return self._move_control(nearest_move(wish)) if self.settings.actions == "discrete" else unit_disc(wish)

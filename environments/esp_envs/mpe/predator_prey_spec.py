@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 from pydantic import Field as Setting
-from pydantic import field_validator, model_validator
+from pydantic import model_validator
 
 from esp_envs.errors import UserError
 from esp_envs.mpe.many import MOST_BODIES
 from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings
 from esp_envs.roles import Role, spec_with_roles
-from esp_envs.settings import Breaks
 from esp_envs.spec import Field, Items, Kind, Layout, TaskSpec, filled_layout
 
 
@@ -25,21 +23,9 @@ class PredatorPreySettings(ParticleSettings):
         "predators",
         description="who learns; with 'prey' the predators follow the heuristic `chase`, with 'both' each side learns",
     )
-    prey: Literal["random", "fleeing", "still", "policy"] = Setting(
+    prey: Literal["random", "fleeing", "still"] = Setting(
         "random", description="who drives the prey while the predators learn"
     )
-    prey_policy: str | None = Setting(
-        None, max_length=255, description="safetensors policy file, for prey 'policy' or a learned_prey above 0"
-    )
-    prey_policy_seed: int = Setting(0, ge=0, description="which of the policy file's seeds drives the prey")
-    learned_prey: Annotated[float, Breaks("c1", agents=False)] = Setting(
-        0.0, ge=0, le=1, description="breaks symmetry: probability of a step in which the prey follows prey_policy"
-    )
-
-    @field_validator("prey_policy")
-    @classmethod
-    def _found_from_anywhere(cls, path: str | None) -> str | None:
-        return path and str(Path(path).absolute())
 
     @property
     def team(self) -> int:
@@ -54,19 +40,10 @@ class PredatorPreySettings(ParticleSettings):
         """The rotations that actions, dynamics and reward carry; the learning prey's bounds are a square."""
         return super().turns if self.control == "predators" else "c4"
 
-    def without_effect(self) -> frozenset[str]:
-        return frozenset({"prey_policy_seed"} if self.prey_policy is None else ())
-
     @model_validator(mode="after")
-    def _policy_goes_with_its_file(self) -> PredatorPreySettings:
-        if self.control != "predators" and (self.prey != "random" or self.learned_prey):
-            raise UserError(f"with control '{self.control}' the prey is a learner; leave prey and learned_prey out")
-        if self.prey == "policy" and self.learned_prey:
-            raise UserError("prey 'policy' follows its file at every step; leave learned_prey out")
-        if (self.prey == "policy" or self.learned_prey > 0) != (self.prey_policy is not None):
-            raise UserError(
-                "the file prey_policy and prey 'policy', or a learned_prey above 0, go together; give both or neither"
-            )
+    def _one_drives_the_prey(self) -> PredatorPreySettings:
+        if self.control != "predators" and self.prey != "random":
+            raise UserError(f"with control '{self.control}' the prey is a learner; leave prey out")
         return self
 
 
@@ -78,7 +55,6 @@ def predator_prey_spec(settings: PredatorPreySettings) -> TaskSpec:
     reward = rewards.get(control, ", ".join(f"{who} {what}" for who, what in rewards.items()))
     opponent = {"prey": "chasing predators", "both": "both learn"}.get(control, f"{settings.prey} prey")
     whole = "d4*agents" if discrete or prey_learns else "o2*agents"
-    learned = [Breaks("c1", agents=False)] if settings.prey == "policy" else []
     sides = {"predators": (settings.num_predators, _predator_layout(settings)), "prey": (1, prey_layout(settings))}
     action = MOVES if discrete else FORCE
     roles = [
@@ -93,7 +69,7 @@ def predator_prey_spec(settings: PredatorPreySettings) -> TaskSpec:
         convention=f"{settings.convention}: {reward}, {opponent}, {order}{settings.broken_in_words()}",
         horizon=settings.horizon,
         state=_state_layout(settings),
-        symmetry=settings.left_of(whole, *learned),
+        symmetry=settings.left_of(whole),
         nearly=whole,
         settings=settings.model_dump(),
     )

@@ -17,10 +17,9 @@ import pytest
 import torch
 
 from esp_cli.training import trackers
-from esp_cli.training.checkpoint import load_checkpoint
+from esp_cli.training.checkpoint import POLICY_FORMAT, load_checkpoint
 from esp_cli.training.metrics import read_metrics
 from esp_cli.training.trackers import Row, TrackedRun, scalars
-from esp_envs.mpe.frozen_prey import POLICY_FORMAT
 from tests.cli.running import STEPS, TINY_OPTIONS, esp, refused, train_tiny
 
 ROOT = Path(__file__).parents[2]
