@@ -19,7 +19,7 @@ _TRAINED, _SEARCHED, _PRIOR, _SETTINGS = "What is trained", "What is searched", 
 _RUN, _OUTPUT, _POLICY, _PICTURE = "How it runs", "Output", "What is evaluated", "Picture"
 _GROUPS: dict[str, tuple[str, ...]] = {
     _TRAINED: ("tasks", "algos", "preset", "steps", "seeds", "seed_list", "drones", "grid", "methods", "group"),
-    _SEARCHED: ("budget", "space", "goal", "reach", "trial_seeds"),
+    _SEARCHED: ("budget", "space", "trial_seeds"),
     _PRIOR: ("transforms", "consistency_coef"),
     _SETTINGS: ("settings", "config", "print_config", "init_from"),
     _RUN: ("resume", "device", "jobs", "dry_run", "seconds", "reuse", "engine", "address", "gpu_share", "no_check"),
@@ -38,7 +38,7 @@ _GROUPS: dict[str, tuple[str, ...]] = {
         "threshold",
     ),
     _PICTURE: ("view", "size", "width", "speed", "fps", "style", "plot", "films"),
-    _OUTPUT: ("out", "force", "json", "csv", "results", "full", "track", "watch", "formats", "name"),
+    _OUTPUT: ("out", "force", "json", "results", "full", "track", "watch", "formats", "name"),
 }
 _MOVED: dict[str, dict[str, str]] = {  # options that belong elsewhere in a command than in the others
     "train": {"task": _TRAINED, "algo": _TRAINED, "network": _TRAINED, "physics": _TRAINED, "prior": _PRIOR},

@@ -60,12 +60,6 @@ def report(
         Literal["screen", "paper"],
         typer.Option("--style", help="Of figures; paper: as wide as a column or a page, small letters, also as PDF."),
     ] = "screen",
-    csv: Annotated[
-        Path | None,
-        typer.Option(
-            "--csv", help="Write every logged number of every seed as a table.", callback=options.not_over_a_run
-        ),
-    ] = None,
     full: Annotated[bool, typer.Option("--full", help="Print every table, not only the answer.")] = False,
     task: options.OwnTaskOption = None,
     algo: options.OwnAlgoOption = None,
@@ -90,10 +84,6 @@ def report(
             raise UserError("--films draws for the page that --out writes; add --out FOLDER, or leave it out")
         material = _side_by_side(runs, options.command_line(context), at or [], limits, mode)
 
-    if csv is not None:
-        from esp_cli.reporting.page import write_csv
-
-        console.note(f"{write_csv(csv, material)} rows -> {csv}")
     _write_page(material, out, films, style)
     if results is not None:
         console.write_json(results, material.results.document())

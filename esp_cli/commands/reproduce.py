@@ -96,5 +96,5 @@ def _judge(benchmark: Benchmark, choices: StudyChoices) -> None:
     if requests:
         raise studying.stopped(choices.command)
     if fresh is not None:
-        studying.report_study(fresh, choices.json, None, ())
+        studying.report_study(fresh, choices.json)
     studying.refuse_failed(failed, out)

@@ -213,7 +213,9 @@ def refuse_failed(names: Sequence[str], out: Path) -> None:
         )
 
 
-def report_study(folder: StudyFolder, json: str | None, mode: Mode | None, thresholds: Sequence[float]) -> None:
+def report_study(
+    folder: StudyFolder, json: str | None, mode: Mode | None = None, thresholds: Sequence[float] = ()
+) -> None:
     """Print the tables of a study and what came out, and say what to do next."""
     from esp_cli.commands.report import print_answer
     from esp_cli.reporting.collect import collect_study

@@ -5,13 +5,13 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from esp_cli import console
 from esp_cli.commands import studying
-from esp_cli.commands.options import check_finite, note_without_effect
+from esp_cli.commands.options import note_without_effect
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
 from esp_cli.console.progress import stop_requests
 from esp_envs.errors import UserError
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 EPILOG = """Examples:\n
     esp tune --task navigation --algo mappo --budget 30 --prior esp,none --dry-run\n
     esp tune --task predator-prey --algo qmix --budget 30 --prior esp,none --steps 500k --out runs/tune-qmix\n
-    esp tune --task mine:Task --algo mappo --space space.toml --for steps --reach -120\n
+    esp tune --task mine:Task --algo mappo --space space.toml\n
     esp train --config runs/tune-qmix/preset-esp.json --seeds 10"""
 
 FIRST_TRIAL_SEED = 1000  # seed of the first trial; the best settings are evaluated on other seeds
@@ -50,24 +50,18 @@ def tune(
             help="esp (the default), none, auto, augment, consistency, or several as esp,none; a search each.",
         ),
     ] = None,
-    goal: Annotated[
-        Literal["return", "steps", "seconds"],
-        typer.Option("--for", help="The highest return at the end, or fewest steps or seconds to the return --reach."),
-    ] = "return",
-    reach: Annotated[float | None, typer.Option("--reach", help="The return to reach.", metavar="RETURN")] = None,
     trial_seeds: Annotated[int, typer.Option("--trial-seeds", min=1, max=100, help="Seeds of each trial.")] = 3,
 ) -> None:
     """Search for better settings; evaluate the best on fresh seeds. Called again, it goes on where it was."""
     priors = parse_names(prior) or ("esp",)
-    check_finite("--reach", *(() if reach is None else (reach,)))
     request = choices.request()
-    tuning = _tuning(request, priors, space, trial_seeds, budget=budget, goal=goal, reach=reach)
+    tuning = _tuning(request, priors, space, trial_seeds, budget)
     idle = frozenset.intersection(*map(tuning.without_effect, priors))
     note_without_effect([name for name in tuning.overrides if name in idle])
     (_forecast if choices.dry_run else _tune)(tuning, request, choices)
 
 
-def _tuning(request: Request, priors: Sequence[str], space: Path | None, trial_seeds: int, **goal: Any) -> Tuning:
+def _tuning(request: Request, priors: Sequence[str], space: Path | None, trial_seeds: int, budget: int) -> Tuning:
     from esp_cli.algorithms.presets import ALGORITHMS
     from esp_cli.studies.catalogue import task_setting
     from esp_cli.studies.tuning import NAMES, Tuning
@@ -90,7 +84,7 @@ def _tuning(request: Request, priors: Sequence[str], space: Path | None, trial_s
         algorithm=algorithm,
         preset=request.preset,
         priors=tuple(priors),
-        **goal,
+        budget=budget,
         steps=steps,
         trial_seeds=tuple(range(FIRST_TRIAL_SEED, FIRST_TRIAL_SEED + trial_seeds)),
         overrides={task_setting(name, task): value for name, value in request.overrides.items()},
@@ -147,10 +141,10 @@ def _tune(tuning: Tuning, request: Request, choices: StudyChoices) -> None:
     if requests:
         raise studying.stopped(choices.command)
     if fresh is not None:
-        studying.report_study(fresh, choices.json, None, () if tuning.reach is None else (tuning.reach,))
+        studying.report_study(fresh, choices.json)
     studying.refuse_failed(failed, out)
     if not best:
-        raise UserError("no trial has a score, so there is nothing to judge; with --reach, name a lower return")
+        raise UserError("no trial has a score, so there is nothing to judge")
 
 
 def _report(search: Search, outcomes: Sequence[Outcome], quiet: bool) -> None:

@@ -32,8 +32,9 @@ _LARGEST = 1e30  # of the numbers that a setting takes; float32, in which most o
 _MAX_INTEGER = 2**63
 _GONE: dict[str, dict[str, object]] = {
     "predator-prey": {"prey_policy": None, "prey_policy_seed": 0, "learned_prey": 0.0},
+    "esp-tuning": {"goal": "return", "reach": None},
 }
-"""Settings that earlier versions wrote into files, with their defaults: of a task, or the prior."""
+"""Settings that earlier versions wrote into files, with their defaults: of a task, the prior, or a document."""
 _TOO_DEEP = f"it is nested more than {MAX_NESTING} deep"
 
 
@@ -86,9 +87,11 @@ class DocumentFormat:
         """Read a document and validate its content; errors as of `read`."""
         content = self.read(path)
         try:
-            return validate(model, content)
+            return validate(model, without_gone(self.name, content))
         except ValidationError as error:
             raise self.error(f"{path} is damaged: {one_sentence(error, model)}") from None
+        except UserError as error:
+            raise self.error(f"{path}: {error}") from None
 
     def write(self, path: str | os.PathLike[str], content: Mapping[str, Any]) -> None:
         """Write a document as a whole or not at all.

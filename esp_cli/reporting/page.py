@@ -1,21 +1,18 @@
-"""What a report writes: Markdown with pictures, one page that needs nothing but a browser, and CSV."""
+"""What a report writes: Markdown with pictures, and one page that needs nothing but a browser."""
 
 from __future__ import annotations
 
 import base64
 import contextlib
-import csv
-import io
 import json
 import math
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, Template
@@ -25,7 +22,7 @@ from esp_cli.drawing.draw import Request, draw
 from esp_cli.files.documents import encode
 from esp_cli.files.formatting import escaped, format_count, format_interval, format_mean
 from esp_cli.files.opening import read_regular
-from esp_cli.files.writing import replace_file, write_file
+from esp_cli.files.writing import replace_file
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.policies.statistics import steps_to_threshold
 from esp_cli.reporting.collect import Material
@@ -35,8 +32,6 @@ from esp_cli.reporting.study_figures import draw_curves, draw_variants
 from esp_cli.reporting.tables import all_tables, markdown_text
 from esp_cli.studies.kinds import kind_of
 from esp_cli.training.folder_names import POLICY
-from esp_cli.training.metrics import read_metrics
-from esp_cli.training.run_folder import RunFolder
 from esp_envs.errors import UserError
 from esp_envs.spec import TaskSpec
 
@@ -46,7 +41,6 @@ _TEMPLATES = Path(__file__).with_name("templates")
 _FILM_PIXELS, _FILM_FRAMES_PER_SECOND = 240, 12.0
 _FILM_SECONDS = 15.0  # a film is sped up to last no longer
 _MAX_FILM_BYTES = 2**26
-_KEYS = ("run", "seed", "step")
 
 
 def write_report(material: Material, out: Path, style: Style = "screen") -> list[Path]:
@@ -126,19 +120,6 @@ def template(name: str) -> Template:
     return Environment(loader=folder, autoescape=True, trim_blocks=True, lstrip_blocks=True).get_template(name)
 
 
-def write_csv(path: Path, material: Material) -> int:
-    """Write the metrics of runs that have begun; return the number of rows."""
-    runs = {cell.name if cell.at is None else cell.variant: material.runs[cell.name] for cell in material.results.cells}
-    rows = [row for name, folder in runs.items() for row in _rows(name, folder)]
-    names = sorted({key for row in rows for key in row} - set(_KEYS))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, (*_KEYS, *names), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_file(path, text.getvalue().encode())
-    return len(rows)
-
-
 def _refuse_foreign(out: Path) -> None:
     """Refuse a folder whose files of these names are not of a report."""
     own = (MARKDOWN, RESULTS, PAGE, f"{CURVES}.png", f"{CURVES}.svg")
@@ -165,20 +146,6 @@ def _fenced(command: str) -> str:
     """Return a block of shell commands, in a fence that is longer than any row of backticks in it."""
     fence = "`" * max(3, *(len(row) + 1 for row in re.findall("`+", command)), 0)
     return f"{fence}sh\n{command}\n{fence}"
-
-
-def _rows(name: str, folder: Path) -> Iterable[dict[str, Any]]:
-    opened = RunFolder.open(folder) if folder.is_dir() else None
-    if opened is None or not opened.metrics_path.is_file():
-        return
-    seeds = opened.config["seeds"]
-    for row in read_metrics(opened.metrics_path):
-        for index, seed in enumerate(seeds):
-            own = {
-                key: ([*value, *[None] * len(seeds)][index] if isinstance(value, list) else value)
-                for key, value in row.items()
-            }
-            yield {**own, "run": name, "seed": seed}
 
 
 _VERDICTS: dict[Side, str] = {"ahead": "is better than", "behind": "is worse than", "level": "is not told apart from"}

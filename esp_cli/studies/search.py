@@ -96,8 +96,7 @@ class Search(RunSet):
 
     def _study(self, storage: Any, prior: str) -> Any:
         pruner = optuna.pruners.SuccessiveHalvingPruner(
-            min_resource="auto" if self.tuning.goal == "seconds" else max(1, self.tuning.steps // REDUCTION**RUNGS),
-            reduction_factor=REDUCTION,
+            min_resource=max(1, self.tuning.steps // REDUCTION**RUNGS), reduction_factor=REDUCTION
         )
         study = optuna.create_study(
             storage=storage, study_name=prior, direction="maximize", pruner=pruner, load_if_exists=True
@@ -179,12 +178,10 @@ class Search(RunSet):
             return False
         trial, complete = self._begun[cell.name], self.is_trained(cell)
         curve = curve_of(self.run_path(cell) / METRICS)
-        keeps_up = self.keeps_up(trial, curve)
-        value, broken = score(curve, self.tuning), bool(curve) and not math.isfinite(curve[-1].mean)
-        if broken or not (complete or self.tuning.goal != "return"):
-            value = None
-        if value is None and keeps_up and not (broken or complete):
+        keeps_up, broken = self.keeps_up(trial, curve), bool(curve) and not math.isfinite(curve[-1].mean)
+        if keeps_up and not (broken or complete):
             return True
+        value = score(curve) if complete and not broken else None
         trial.study.tell(trial.number, value, state=TrialState.PRUNED if value is None else TrialState.COMPLETE)
         return False
 
@@ -192,10 +189,9 @@ class Search(RunSet):
         """Record evaluations of a trial that are not recorded yet; return whether the trial may go on after each."""
         known = trial.study.get_trials(deepcopy=False)[trial.number].last_step
         for point in points:
-            resource = int(point.seconds) if self.tuning.goal == "seconds" else point.step
-            if (known is None or resource > known) and math.isfinite(point.value):
-                trial.report(point.value, resource)
-                known = resource
+            if (known is None or point.step > known) and math.isfinite(point.value):
+                trial.report(point.value, point.step)
+                known = point.step
                 if trial.number > 0 and point.step < self.tuning.steps and trial.should_prune():
                     return False
         return True

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from pydantic import Field, JsonValue
 
@@ -17,10 +16,9 @@ from esp_cli.studies.run_set import Cell, StudyError
 from esp_cli.studies.study import Study
 from esp_cli.studies.tuning_space import Dimension, space_of
 from esp_cli.training.config import RunConfig, resolve_config
-from esp_cli.training.metrics import column, elapsed_s, read_metrics
+from esp_cli.training.metrics import column, read_metrics
 from esp_envs.errors import UserError
 
-Goal = Literal["return", "steps", "seconds"]
 SMOOTHED = 3  # evaluations, up to the newest, whose mean is the score of a curve
 RUNGS = 2  # times that successive halving looks at a trial before its end
 REDUCTION = 3  # one of so many trials goes on at each rung, and trains so many times as long
@@ -37,8 +35,6 @@ class Tuning(Strict):
     preset: str = "default"  # of every run
     priors: tuple[str, ...]  # kinds of prior; each has a search of its own with the same budget
     budget: int = Field(ge=1)  # trials for each prior
-    goal: Goal = "return"  # "return" at the end, or the fewest steps or seconds to the return `reach`
-    reach: float | None = None  # that return
     steps: int = Field(ge=1)  # environment steps per seed of a trial that is not pruned
     trial_seeds: tuple[int, ...]  # of every trial
     overrides: dict[str, JsonValue] = Field({})  # settings of all runs, as `--set` takes them
@@ -68,9 +64,6 @@ class Tuning(Strict):
         shared = set(seeds) & set(self.trial_seeds)
         if shared:
             raise UserError(f"seed {min(shared)} belongs to the trials; choose --seeds that no trial has")
-        if (self.goal == "return") != (self.reach is None):
-            what = "needs --reach RETURN" if self.reach is None else "takes no --reach"
-            raise UserError(f"--for {self.goal} {what}; --reach is the return to come to in fewest steps or seconds")
         if "prior.kind" in self.overrides or "prior.kind" in self.space:
             raise UserError("a tuning takes the kinds of prior by --prior, not by --set or --space")
         effective, searched = set[str](), set[str]()
@@ -113,7 +106,7 @@ class Outcome:
     prior: str
     trials: int  # that were begun
     completed: int  # trials with a score
-    pruned: int  # trials that were ended early, broke, or did not reach the return
+    pruned: int  # trials that were ended early or broke
     refused: tuple[str, ...]  # why settings did not go together, one text for each such trial; they count as pruned
     env_steps: int  # of all seeds of all trials
     seconds: float  # of training, all trials added up
@@ -128,7 +121,6 @@ class Point:
     """An evaluation of a trial."""
 
     step: int  # environment steps per seed
-    seconds: float  # of training
     mean: float  # greedy return, mean over the seeds; NaN where a seed stopped
     value: float  # mean of the newest evaluations up to this one
 
@@ -139,21 +131,14 @@ def curve_of(metrics: Path) -> list[Point]:
     if not rows:
         return []
     steps, returns = column(rows, "eval/return_greedy")
-    means, seconds = returns.mean(1).tolist(), [elapsed_s(row) for row in rows]
+    means = returns.mean(1).tolist()
     recent = [means[max(0, k + 1 - SMOOTHED) : k + 1] for k in range(len(means))]
-    return [
-        Point(int(step), seconds[k], means[k], math.fsum(recent[k]) / len(recent[k])) for k, step in enumerate(steps)
-    ]
+    return [Point(int(step), means[k], math.fsum(recent[k]) / len(recent[k])) for k, step in enumerate(steps)]
 
 
-def score(curve: Sequence[Point], tuning: Tuning) -> float | None:
-    """Return the score of a curve, the larger the better (steps and seconds negative); None if it missed the return."""
-    if tuning.goal == "return":
-        return curve[-1].value if curve and math.isfinite(curve[-1].value) else None
-    first = next((p for p in curve if tuning.reach is not None and p.mean >= tuning.reach), None)
-    if first is None:
-        return None
-    return float(-first.step) if tuning.goal == "steps" else -first.seconds
+def score(curve: Sequence[Point]) -> float | None:
+    """Return the score of a curve, its last value; None where that is not finite."""
+    return curve[-1].value if curve and math.isfinite(curve[-1].value) else None
 
 
 def fresh_study(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 import shlex
@@ -17,7 +16,6 @@ from esp_cli.studies.study import STUDY_FORMAT, StudyFolder
 from esp_cli.studies.tuning import TUNING_FORMAT
 from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
 from esp_cli.training.folder_names import TUNING
-from esp_cli.training.metrics import read_metrics
 from tests.cli.running import DAMAGE, esp, refused, train_tiny
 
 
@@ -25,21 +23,6 @@ from tests.cli.running import DAMAGE, esp, refused, train_tiny
 def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of the same seeds without the prior."""
     return train_tiny(tmp_path_factory.mktemp("runs") / "plain", "--seed-list", "3,7", "--prior", "none")
-
-
-def test_every_logged_number_is_a_cell_of_the_csv(finished: Path, plain: Path, tmp_path: Path) -> None:
-    file = tmp_path / "new" / "all.csv"
-    esp("report", f"a,b={plain}", finished, "--csv", file, "--json", "-")
-    with file.open(newline="") as opened:
-        rows = list(csv.DictReader(opened))
-    assert {(row["run"], row["seed"]) for row in rows} == {
-        (name, seed) for name in ("a,b", "finished") for seed in "37"
-    }
-    for run, name in ((plain, "a,b"), (finished, "finished")):
-        for logged in read_metrics(run / "metrics.jsonl"):
-            (row,) = [r for r in rows if (r["run"], r["seed"], r["step"]) == (name, "7", str(logged["step"]))]
-            assert row["eval/return_greedy"] == str(logged.get("eval/return_greedy", [None, ""])[1])
-            assert row["time/elapsed_s"] == str(logged.get("time/elapsed_s", "")), "a number of the whole run"
 
 
 def cells(line: str) -> list[str]:
@@ -205,7 +188,7 @@ def test_damaged_metrics_are_told_in_one_sentence(copied: Path, content: str, se
     assert sentence in refused("report", copied)
 
 
-@pytest.mark.parametrize("option", ["--csv", "--json", "--results"])
+@pytest.mark.parametrize("option", ["--json", "--results"])
 def test_what_a_run_or_a_study_needs_is_not_overwritten_by_a_report(copied: Path, tmp_path: Path, option: str) -> None:
     study = tmp_path / "study"
     study.mkdir()

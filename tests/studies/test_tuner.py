@@ -152,7 +152,7 @@ def test_a_third_goes_on_after_a_ninth_and_after_a_third_of_the_steps(tmp_path):
     ends = []
     for number, value in enumerate((0.0, 9.0, 6.0, 7.0, 8.0, 5.0, 8.5, 8.2, 8.3, 8.4)):
         trial = made.trial("none", number)
-        looks = [Point(step, step / 10, value, value) for step in range(50, 901, 50)]
+        looks = [Point(step, value, value) for step in range(50, 901, 50)]
         assert made.keeps_up(trial, looks) == (number in (0, 1))
         ends.append(made.trials("none")[number].last_step)
     assert ends == [900, 900, 100, 100, 100, 100, 300, 100, 100, 300]
@@ -193,21 +193,6 @@ def test_a_stopped_search_goes_on_with_the_trials_that_it_began(tmp_path):
     again = CurveEngine()
     assert search(tmp_path / "t", tuning(), again).complete
     assert again.started[:2] == ["esp-000", "none-000"]
-
-
-def test_a_trial_ends_when_it_reaches_the_return(tmp_path):
-    plan = tuning(goal="steps", reach=-40.0, priors=("none",), budget=8)
-    found = search(tmp_path / "t", plan).folder.outcome("none")
-    last = last_step(tmp_path / "t" / "trials" / f"none-{found.best:03d}")
-    assert 0 <= -found.best_score <= last <= 200 - found.best_score < 900
-    assert search(tmp_path / "u", plan.model_copy(update={"reach": 1e6})).folder.outcome("none").best is None
-
-
-def test_the_return_to_come_to_stands_beside_the_word_and_a_score_at_the_end_names_none():
-    steps = budget_sentence(tuning(goal="steps", reach=-250.0))
-    assert steps.endswith("Score: environment steps to the return -250, as a negative number.")
-    assert "seconds of training to the return -40.5, as a" in budget_sentence(tuning(goal="seconds", reach=-40.5))
-    assert budget_sentence(tuning()).endswith("Score: mean of the last three greedy evaluations.")
 
 
 def test_a_broken_trial_is_never_the_best_and_a_failed_one_is_tried_again_with_its_settings(tmp_path):
@@ -377,6 +362,4 @@ def test_the_best_settings_are_a_file_for_training_and_the_page_states_the_budge
     rows = budget_table(made.tuning, outcomes).rows
     assert [row[1] for row in rows] == ["16", "16"]
     assert all(f"| {' | '.join(row)} |" in page for row in (*rows, *settings_table(outcomes).rows))
-    pictures = {line.split("(")[1].rstrip(")") for line in page.splitlines() if line.startswith("![")}
-    assert {"esp-optimization-history.png", "none-importances.png"} <= pictures
-    assert all((tmp_path / "t" / "report" / name).stat().st_size > 1000 for name in pictures)
+    assert "Score: mean of the last three greedy evaluations." in page

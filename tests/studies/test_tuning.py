@@ -9,7 +9,8 @@ import re
 import pytest
 
 from esp_cli.algorithms.presets import ALGORITHMS
-from esp_cli.studies.tuning import Point, Tuning, curve_of, fresh_study, score
+from esp_cli.studies.run_set import StudyError
+from esp_cli.studies.tuning import TUNING_FORMAT, Point, Tuning, curve_of, fresh_study, score
 from esp_cli.studies.tuning_space import Dimension, default_space, read_space, space_of
 from esp_cli.training.metrics import MetricsError
 from tests.training.runs import TINY
@@ -34,7 +35,7 @@ def tuning(**changes) -> Tuning:
 
 
 def points(*means: float) -> list[Point]:
-    return [Point(100 * k, 10.0 * k, mean, mean) for k, mean in enumerate(means)]
+    return [Point(100 * k, mean, mean) for k, mean in enumerate(means)]
 
 
 @pytest.mark.parametrize("algorithm", ["mappo", "maddpg", "qmix"])
@@ -110,8 +111,6 @@ def test_a_space_that_says_nothing_is_refused(tmp_path, text, sentence):
             {"space": {"prior.consistency_coef": Dimension(low=0.1, high=1.0)}},
             "with --prior none no setting of the space",
         ),
-        ({"goal": "steps"}, "--for steps needs --reach RETURN"),
-        ({"reach": -100.0}, "--for return takes no --reach"),
     ],
 )
 def test_what_cannot_be_run_is_refused_before_anything_is(changes, sentence):
@@ -138,27 +137,30 @@ def test_what_a_prior_leaves_to_be_measured_is_measured_for_every_trial():
     assert prior.weights["rot180"] < 0.1
 
 
-def test_a_curve_is_scored_by_its_end_or_by_when_it_reaches_a_return():
-    curve = points(-30.0, -20.0, -10.0, -12.0)
-    assert score(curve, tuning()) == -12.0
-    assert score(curve, tuning(goal="steps", reach=-15.0)) == -200.0
-    assert score(curve, tuning(goal="seconds", reach=-15.0)) == -20.0
-    assert score(curve, tuning(goal="steps", reach=-5.0)) is None
-    assert score(points(-30.0, math.nan), tuning()) is None
-    assert score([], tuning()) is None
+def test_a_curve_is_scored_by_its_end():
+    assert score(points(-30.0, -20.0, -10.0, -12.0)) == -12.0
+    assert score(points(-30.0, math.nan)) is None
+    assert score([]) is None
+
+
+def test_a_tuning_of_an_earlier_version_loads_unless_it_was_for_steps_or_seconds(tmp_path):
+    path, stored = tmp_path / "tuning.json", tuning().model_dump(mode="json")
+    TUNING_FORMAT.write(path, stored | {"goal": "return", "reach": None})
+    assert TUNING_FORMAT.parse(path, Tuning) == tuning()
+    TUNING_FORMAT.write(path, stored | {"goal": "steps", "reach": -15.0})
+    with pytest.raises(StudyError, match=r"tuning\.json: this esp has no 'goal' any more; use the esp that wrote it"):
+        TUNING_FORMAT.parse(path, Tuning)
 
 
 def test_the_value_of_a_point_is_the_mean_of_the_newest_evaluations(tmp_path):
     path = tmp_path / "metrics.jsonl"
-    rows = [{"step": 100 * k, "eval/return_greedy": [-8.0 * k, 0.0], "time/elapsed_s": k} for k in range(5)]
+    rows = [{"step": 100 * k, "eval/return_greedy": [-8.0 * k, 0.0]} for k in range(5)]
     rows.insert(1, {"step": 50})
-    rows[-1]["time/elapsed_s"] = [4.0]
     path.write_text("".join(json.dumps(row) + "\n" for row in rows))
     found = curve_of(path)
     assert [point.step for point in found] == [0, 100, 200, 300, 400]
     assert [point.mean for point in found] == [0.0, -4.0, -8.0, -12.0, -16.0]
     assert [point.value for point in found] == [0.0, -2.0, -4.0, -8.0, -12.0]
-    assert [point.seconds for point in found] == [0.0, 1.0, 2.0, 3.0, 0.0], "a list is no number of seconds"
     assert curve_of(tmp_path / "none") == []
     path.write_text('{"step": 0}\nno row\n{"step": 1}\n')
     with pytest.raises(MetricsError, match=r"metrics\.jsonl is damaged: line 2"):
