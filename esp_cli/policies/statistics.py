@@ -8,7 +8,7 @@ intervals hold its mean). They are None where the bootstrap cannot tell: one see
 has ascending steps [K], env steps per seed, and values [K, S], or a UserError.
 
 Source: Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", NeurIPS 2021
-(interquartile mean, stratified bootstrap, probability of improvement).
+(interquartile mean, bootstrap intervals, probability of improvement).
 """
 
 from __future__ import annotations
@@ -95,17 +95,6 @@ def interquartile_mean(values: ArrayLike) -> Estimate:
     return Estimate(float(_iqm(sample)), _interval((sample,), _iqm))
 
 
-def aggregate(scores: Mapping[str, ArrayLike], statistic: Literal["iqm", "mean"] = "iqm") -> Estimate:
-    """Return a statistic of all seeds of tasks, normalised to compare; seeds are redrawn within a task."""
-    samples = tuple(_sample(values, f"of {task}") for task, values in scores.items())
-    inner = _iqm if statistic == "iqm" else np.mean
-
-    def pooled(*drawn: Floats, axis: int = -1) -> Any:
-        return inner(np.concatenate(drawn, axis=axis), axis=axis)
-
-    return Estimate(float(pooled(*samples)), _interval(samples, pooled))
-
-
 def difference(x: ArrayLike, y: ArrayLike, paired: bool = False) -> Estimate:
     """Return mean(x) - mean(y); paired, seed k of x and of y belong together (S = S'), as where they share worlds."""
     first, second = _sample(x), _sample(y)
@@ -143,12 +132,6 @@ def holm(p_values: Sequence[float]) -> list[float]:
         largest = max(largest, min(1.0, (len(p_values) - k) * p_values[index]))
         corrected[index] = largest
     return corrected
-
-
-def average_improvement(pairs: Mapping[str, tuple[ArrayLike, ArrayLike]]) -> Estimate:
-    """Return the probability of improvement, paired by seed, as a mean over tasks with a stratified bootstrap."""
-    wins = {task: _wins(_sample(x), _sample(y)) for task, (x, y) in pairs.items()}
-    return aggregate(wins, "mean")
 
 
 def leader(
@@ -272,12 +255,11 @@ def _share_of_wins(x: Floats, y: Floats, axis: int = -1) -> Any:
     return _wins(x[..., :, None], y[..., None, :]).mean(axis=(-2, -1))
 
 
-def _sample(values: ArrayLike, where: str = "") -> Floats:
+def _sample(values: ArrayLike) -> Floats:
     sample = np.asarray(values, dtype=np.float64)
-    label = f"the values {where}".strip()
     if sample.ndim != 1 or sample.size == 0:
-        raise UserError(f"{label} have to be one number per seed, not of shape {list(sample.shape)}")
+        raise UserError(f"the values have to be one number per seed, not of shape {list(sample.shape)}")
     bad = np.flatnonzero(~np.isfinite(sample)).tolist()
     if bad:
-        raise UserError(f"{label} are not finite at index {bad}; leave those seeds out and say so beside the result")
+        raise UserError(f"the values are not finite at index {bad}; leave those seeds out and say so beside the result")
     return sample

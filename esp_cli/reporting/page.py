@@ -164,8 +164,6 @@ def answer(material: Material) -> list[str]:
     if pairs and kind_of(results.kind).benchmark:
         return [_ranking(panel, results) for panel in dict.fromkeys(cell.panel for cell, _ in pairs)]
     texts = _count(pairs) if pairs else [_returns(results, cell) for cell in finished[:2]]
-    if means := [f"{name} {one.mean.value:.2f}" for name, one in results.aggregates.items()]:
-        texts.append(f"Mean normalised return over all panels, {_SCALE}: {', '.join(means)}.")
     return texts or ["No run has a return yet."]
 
 

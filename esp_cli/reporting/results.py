@@ -22,8 +22,6 @@ from esp_cli.policies.statistics import (
     Floats,
     Passing,
     SeedSummary,
-    aggregate,
-    average_improvement,
     difference,
     holm,
     interquartile_mean,
@@ -68,16 +66,6 @@ class CellSummary:
     gap: Gap | None = None  # to the cell's reference
     # "first" where our mean is higher than the paper's, "second" where the paper's is
     leader: Literal["first", "second", "neither"] | None = None
-
-
-@dataclass(frozen=True)
-class Aggregate:
-    """Numbers of one variant over all panels, of normalised returns."""
-
-    iqm: Estimate  # interquartile mean
-    mean: Estimate  # of all seeds of all panels
-    # mean probability of improvement over the panel's reference, where every panel has one
-    improvement: Estimate | None
 
 
 class CellResult(BaseModel):
@@ -132,14 +120,13 @@ class Results(BaseModel):
     config: dict[str, JsonValue]  # settings by dotted name that all cells share
     cells: tuple[CellResult, ...] = Field(min_length=1)  # in the study's order
     left_out: dict[str, str] = {}  # by "TASK: METHOD" why there is no such cell
-    aggregates: dict[str, Aggregate] = {}  # statistics over all panels by variant, where there are several panels
 
     def reference_of(self, cell: CellResult) -> CellResult | None:
         return next((other for other in self.cells if other.name == cell.reference), None)
 
     def document(self, statistics: bool = False) -> dict[str, Any]:
         """Return the document as `esp report --json` writes it with statistics, and `--results` without."""
-        computed: Any = None if statistics else {"aggregates": True, "cells": {"__all__": {"summary"}}}
+        computed: Any = None if statistics else {"cells": {"__all__": {"summary"}}}
         return RESULTS_FORMAT.document(self.model_dump(mode="json", exclude_defaults=True, exclude=computed))
 
 
@@ -149,11 +136,11 @@ def read_results(path: Path) -> Results:
 
 
 def summarised(results: Results) -> Results:
-    """Return results with the statistics of each cell and over all panels, computed from its numbers."""
+    """Return results with the statistics of each cell, computed from its numbers."""
     cells = tuple(cell.model_copy(update={"summary": summarise_cell(results, cell)}) for cell in results.cells)
     if kind_of(results.kind).benchmark:
         cells = _corrected(results, cells)
-    return results.model_copy(update={"cells": cells, "aggregates": aggregates(results)})
+    return results.model_copy(update={"cells": cells})
 
 
 def summarise_cell(results: Results, cell: CellResult) -> CellSummary | None:
@@ -177,34 +164,6 @@ def summarise_cell(results: Results, cell: CellResult) -> CellSummary | None:
         gap=_gap(results, cell, values),
         leader=None if cell.paper is None else leader(ours, (*cell.paper, NUM_SEEDS)),
     )
-
-
-def aggregates(results: Results) -> dict[str, Aggregate]:
-    """Return numbers over all panels by variant, with intervals whose bootstrap redraws seeds within each panel.
-
-    Only variants with two or more panels, all of them finished and with anchors.
-    """
-    out: dict[str, Aggregate] = {}
-    for variant in dict.fromkeys(cell.variant for cell in results.cells):
-        own = [cell for cell in results.cells if cell.variant == variant]
-        scores: dict[str, Floats] = {}
-        pairs: dict[str, tuple[Floats, Floats]] = {}
-        for cell in own:
-            values = returns_of(cell, results.mode)
-            scaled = None if values is None or not np.isfinite(values).all() else normalised(values, cell.anchors)
-            if values is None or scaled is None:
-                break
-            scores[cell.panel] = scaled
-            other = results.reference_of(cell)
-            others = None if other is None or other.seeds != cell.seeds else returns_of(other, results.mode)
-            if others is not None and np.isfinite(others).all() and others.size >= MIN_SEEDS_TO_RANK:
-                pairs[cell.panel] = (values, others)
-        if len(scores) < max(2, len(own)):
-            continue
-        whole = len(pairs) == len(own) and len({x.size for x, _ in pairs.values()}) == 1
-        improvement = average_improvement(pairs) if whole else None
-        out[variant] = Aggregate(aggregate(scores, "iqm"), aggregate(scores, "mean"), improvement)
-    return out
 
 
 def returns_of(cell: CellResult, mode: Mode) -> Floats | None:

@@ -1,4 +1,4 @@
-"""Results as tables: the study's own layout, every statistic of every cell, and numbers over all panels."""
+"""Results as tables: the study's own layout, and every statistic of every cell."""
 
 from __future__ import annotations
 
@@ -182,19 +182,6 @@ def left_out_table(results: Results) -> Table:
     return Table("Left out", ("task", "methods", "reason"), rows)
 
 
-def aggregates_table(results: Results) -> Table:
-    """Return the numbers over all panels; no rows where no variant is finished in two."""
-    numbers = results.aggregates
-    columns: Columns[str] = {
-        "run": str,
-        "IQM>": lambda variant: _estimate(numbers[variant].iqm),
-        "mean>": lambda variant: _estimate(numbers[variant].mean),
-        "P(improvement over the reference)>": lambda variant: _estimate(numbers[variant].improvement),
-    }
-    caption = "Of normalised returns over all panels; 95 % intervals by a bootstrap that is stratified by panel."
-    return table("Over all panels", columns, numbers, caption)
-
-
 def provenance_table(results: Results) -> Table:
     """Return what was run, by which version, and how long it took."""
     # each run once: a report may look at several of its steps, and it may not have reached the last of them
@@ -216,7 +203,6 @@ TABLES: Mapping[str, Callable[[Results], Table]] = {
     "comparison": comparison_table,
     "statistics": statistics_table,
     "steps": steps_table,
-    "aggregates": aggregates_table,
     "left-out": left_out_table,
     "provenance": provenance_table,
 }

@@ -112,7 +112,6 @@ def test_a_study_runs_from_a_command_to_a_page_and_a_small_file(tmp_path: Path) 
     assert [cell.pop("summary")["returns"]["per_seed"] for cell in results["cells"]] == [
         cell["returns"]["greedy"] for cell in results["cells"]
     ]
-    results.pop("aggregates", None)
     assert json.loads(small.read_text()) == results
     assert f"report -> {out / 'report' / 'report.html'}" in report.stderr
     assert (out / "report" / "report.html").read_text().count("data:image/gif") == 2

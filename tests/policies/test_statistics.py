@@ -12,7 +12,6 @@ from esp_cli.policies.statistics import (
     EpisodeSpread,
     Estimate,
     Passing,
-    aggregate,
     area_under_curve,
     bootstrap_interval,
     curve_band,
@@ -61,8 +60,6 @@ def test_a_stopped_seed_is_never_dropped_in_silence(bad):
     for function in (mean_and_sem, bootstrap_interval, interquartile_mean):
         with pytest.raises(ValueError, match=r"not finite at index \[1\]; leave those seeds out and say so"):
             function([1.0, bad, 2.0])
-    with pytest.raises(ValueError, match="of pursuit are not finite"):
-        aggregate({"navigation": [1.0, 2.0], "pursuit": [bad]})
 
 
 def test_interquartile_mean_by_hand():
@@ -72,26 +69,6 @@ def test_interquartile_mean_by_hand():
     assert interquartile_mean(range(10)).value == 4.5
     # of three, none
     assert interquartile_mean([0, 0, 3]).value == 1.0
-
-
-def test_aggregate_pools_all_seeds_of_all_tasks():
-    scores = {"a": [0.0, 1.0, 2.0, 3.0], "b": [10.0, 11.0, 12.0, 13.0]}
-    # of eight, two go at either end: (2 + 3 + 10 + 11) / 4
-    assert aggregate(scores).value == 6.5
-    assert aggregate(scores, "mean").value == 6.5
-    assert aggregate({"a": [0.0, 4.0], "b": [2.0]}, "mean") == Estimate(2.0, None)
-
-
-def test_the_aggregate_bootstrap_is_stratified():
-    # no seed differs within its task, so that redrawing within tasks changes nothing; pooled redrawing would
-    scores = {"easy": [1.0] * 5, "hard": [0.0] * 5}
-    assert aggregate(scores, "mean") == Estimate(0.5, None)
-    assert bootstrap_interval([*scores["easy"], *scores["hard"]]) == (pytest.approx(0.2), pytest.approx(0.8))
-
-
-def test_aggregate_of_one_task_is_the_statistic_of_that_task():
-    assert aggregate({"a": TEN}, "mean").ci95 == pytest.approx(bootstrap_interval(TEN))
-    assert aggregate({"a": TEN}) == interquartile_mean(TEN)
 
 
 def test_difference_by_hand():

@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import pytest
 
-from esp_cli.policies.statistics import Passing, average_improvement, leader
+from esp_cli.policies.statistics import Passing, leader
 from esp_cli.reporting.collect import collect_study
-from esp_cli.reporting.results import aggregates, read_results, summarise_cell, summarised
+from esp_cli.reporting.results import read_results, summarise_cell, summarised
 from esp_cli.reporting.tables import TABLES, all_tables, returns_table
 from esp_cli.studies.study import StudyFolder
 from esp_cli.training.folder_names import POLICY
@@ -146,48 +146,6 @@ def test_who_leads_with_few_seeds_beside_many():
     assert leader((4.0, 1.0, 4), (0.0, 1.0, 16)) == "first"
     assert leader((0.0, 1.0, 16), (4.0, 1.0, 4)) == "second"
     assert leader((3.0, 1.0, 4), (0.0, 1.0, 16)) == "neither"
-
-
-def test_numbers_over_all_panels_weigh_them_alike(tmp_path):
-    study = small_study(tasks=("navigation", "predator-prey"))
-    found = collect_study(write_study(tmp_path / "s", study, {"MAPPO": PLAIN, "MAPPO-ESP": ESP})).results
-    over = aggregates(found)
-    assert list(over) == ["MAPPO", "MAPPO-ESP"]
-    assert over["MAPPO"].mean.value == pytest.approx(0.5)
-    # 0.7 0.8 0.6 twice; a quarter of six is one at either end: 0.6 0.7 0.7 0.8
-    assert over["MAPPO-ESP"].iqm.value == pytest.approx(0.7)
-    assert over["MAPPO-ESP"].improvement.value == pytest.approx(2.5 / 3)
-    assert over["MAPPO"].improvement is None
-    one = collect_study(write_study(tmp_path / "one", small_study(), {"MAPPO": PLAIN, "MAPPO-ESP": ESP})).results
-    assert aggregates(one) == {}
-    assert TABLES["aggregates"](one).rows == ()
-
-
-def test_a_variant_that_has_not_finished_every_panel_has_no_numbers_over_all(tmp_path):
-    ends = {"MAPPO": PLAIN, "MAPPO-ESP": ESP}
-    found = collect_study(write_study(tmp_path / "s", small_study(tasks=("navigation", "predator-prey")), ends)).results
-    begun = found.cells[1].model_copy(update={"name": "third", "panel": "third", "returns": {}})
-    assert list(aggregates(found.model_copy(update={"cells": (*found.cells, begun)}))) == ["MAPPO"]
-
-
-def test_panels_of_different_seeds_have_no_mean_probability_of_improvement(tmp_path):
-    ends = {"MAPPO": PLAIN, "MAPPO-ESP": ESP}
-    found = collect_study(write_study(tmp_path / "s", small_study(tasks=("navigation", "predator-prey")), ends)).results
-    assert aggregates(found)["MAPPO-ESP"].improvement is not None
-    fewer = [
-        cell.model_copy(update={"seeds": cell.seeds[:2], "returns": {"greedy": cell.returns["greedy"][:2]}})
-        for cell in found.cells[2:]
-    ]
-    found = found.model_copy(update={"cells": (*found.cells[:2], *fewer)})
-    assert aggregates(found)["MAPPO-ESP"].improvement is None
-    assert aggregates(found)["MAPPO-ESP"].mean.value == pytest.approx((0.7 * 3 + 0.75 * 2) / 5)
-
-
-def test_the_mean_probability_of_improvement_by_hand():
-    # two wins of two, and one of two: 3 of 4; redrawn within each task, the first always gives 1
-    found = average_improvement({"a": ([1.0, 2.0], [0.0, 0.0]), "b": ([1.0, 0.0], [0.0, 1.0])})
-    assert found.value == 0.75
-    assert found.ci95 == (0.5, 1.0)
 
 
 def test_a_stopped_seed_is_shown_and_nothing_is_compared_with_it(tmp_path):
