@@ -167,12 +167,6 @@ class Maddpg(ExploringLearner):
             return self.joint.value(self.critic, seen, own)
         return self.joint.exchanged(self.critic, seen, self._encoded(rows), own.unsqueeze(-2)).squeeze(-1)
 
-    def _condition(self, batch: EpisodeBatch) -> dict[str, Tensor]:
-        if self.config.critic_activation != "relu" or not isinstance(self.critic, MLP):
-            return {}
-        rows = self.joint.inputs(self.critic_rows(batch)[:, :, :-1], self._encoded(batch))
-        return {"train/critic_idle_units": self.critic.idle_units(rows.flatten(1, -2))}
-
     @torch.no_grad()
     def _targets(self, batch: EpisodeBatch, seen: Tensor) -> Tensor:
         """Return y = r + gamma Q^-(s', pi^-(o')) for the originals: [S, B, T, C]."""

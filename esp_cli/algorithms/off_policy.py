@@ -117,7 +117,7 @@ class OffPolicyLearner(Learner):
         if learned:
             metrics |= {f"train/{name}": value / learned for name, value in sums.items()}
             errors = self.prior.errors(batch.first(PROBE_EPISODES), self.answers)
-            metrics |= {f"train/{name}": error for name, error in errors.items()} | self._condition(batch)
+            metrics |= {f"train/{name}": error for name, error in errors.items()}
         return self.iteration(metrics, *(value for name, value in sums.items() if name in self.watched))
 
     @abstractmethod
@@ -198,10 +198,6 @@ class OffPolicyLearner(Learner):
             epsilon=self.config.adam_epsilon,
             max_grad_norm=self.config.max_grad_norm,
         )
-
-    def _condition(self, _: EpisodeBatch) -> dict[str, Tensor]:
-        """Return what tells of the networks' condition, [S] each, on the last batch of an iteration."""
-        return {}
 
     @property
     def has_learned(self) -> bool:

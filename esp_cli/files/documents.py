@@ -32,6 +32,7 @@ _LARGEST = 1e30  # of the numbers that a setting takes; float32, in which most o
 _MAX_INTEGER = 2**63
 _GONE: dict[str, dict[str, object]] = {
     "predator-prey": {"prey_policy": None, "prey_policy_seed": 0, "learned_prey": 0.0},
+    "prior": {"stop_gradient": "none"},
     "esp-tuning": {"goal": "return", "reach": None},
 }
 """Settings that earlier versions wrote into files, with their defaults: of a task, the prior, or a document."""

@@ -106,18 +106,6 @@ class SeedMLP(nn.Module):
         x = activate_(sums, self.activation)
         return x.float() if len(self.layers) == 1 else self._from_layer(1, [x])
 
-    @torch.no_grad()
-    def idle_units(self, x: Tensor) -> Tensor:
-        """Return the share [S] of a relu network's hidden units that are 0 for every row of x (Sokar et al., 2023)."""
-        x = x if self.norms is None else self.norms[0](x)
-        idle = []
-        for k, layer in enumerate(self.layers if self.activate_output else self.layers[:-1]):
-            x = torch.relu(layer(x))
-            idle.append((x <= 0).all(1))
-            if self.norms is not None and k + 1 < len(self.norms):
-                x = self.norms[k + 1](x)
-        return torch.cat(idle, 1).float().mean(1)
-
     def forward_with_vjp(self, x: Tensor) -> tuple[Tensor, Callable[[Tensor], list[Tensor]]]:
         """Map [S, ..., in] as `forward` does, without a graph, and return the VJP; not with layer normalisation."""
         return perceptron_with_vjp(self._shape(), [x], self._from(0))

@@ -48,8 +48,8 @@ class Policies(ABC):
         """Add the slope of what depends on log pi(action), by which it is [S, L, R], and on these entropies."""
 
     @abstractmethod
-    def add_divergence_slope(self, slope: Any, weights: Weights, stop_gradient: str) -> Any:
-        """Add the slope of the sum of divergences times weights; see `PriorConfig` for `stop_gradient`."""
+    def add_divergence_slope(self, slope: Any, weights: Weights) -> Any:
+        """Add the slope of the sum of divergences times weights."""
 
     @abstractmethod
     def back(self, slope: Any) -> list[tuple[WithVJP, Tensor]]:
@@ -93,12 +93,10 @@ class CategoricalPolicies(Policies):
             slope[:, :, :learned].sub_(self._inner[:, :, :learned] * _beside(by_entropy))
         return slope.scatter_add_(1, _index(action, learned), by_log_prob.unsqueeze(1))
 
-    def add_divergence_slope(self, slope: Tensor | None, weights: Weights, stop_gradient: str) -> Tensor:
+    def add_divergence_slope(self, slope: Tensor | None, weights: Weights) -> Tensor:
         slope, weights = torch.zeros_like(self.probs) if slope is None else slope, _beside(weights)
-        if stop_gradient != "transformed":
-            slope[:, :, 1:].add_(self._gap(slice(1, None), slice(1)) * weights)
-        if stop_gradient != "original":
-            slope[:, :, :1].sub_((self.probs[:, :, 1:] * weights).sum(2, keepdim=True))
+        slope[:, :, 1:].add_(self._gap(slice(1, None), slice(1)) * weights)
+        slope[:, :, :1].sub_((self.probs[:, :, 1:] * weights).sum(2, keepdim=True))
         return slope
 
     def back(self, slope: Tensor) -> list[tuple[WithVJP, Tensor]]:
@@ -139,10 +137,9 @@ class CompiledCategoricalPolicies(Policies):
         """Add the slope of a clipped objective and of entropies, which the kernel computes with it."""
         return [*(slope or []), Slope(clipped=clipped)]
 
-    def add_divergence_slope(self, slope: Any, weights: Weights, stop_gradient: str) -> list[Slope]:
+    def add_divergence_slope(self, slope: Any, weights: Weights) -> list[Slope]:
         *before, last = slope or [Slope()]
-        gaps = (weights, stop_gradient)
-        return [*before, last._replace(gaps=gaps)] if last.gaps is None else [*before, last, Slope(gaps=gaps)]
+        return [*before, last._replace(gaps=weights)] if last.gaps is None else [*before, last, Slope(gaps=weights)]
 
     def back(self, slope: list[Slope]) -> list[tuple[WithVJP, Tensor]]:
         outputs = self._outputs
@@ -212,9 +209,7 @@ class GaussianPolicies(Policies):
         by_means[:, :learned].add_(z.mul_(self._precision[:, :learned]).mul_(above))
         return by_means, by_log_std
 
-    def add_divergence_slope(
-        self, slope: tuple[Tensor, Tensor] | None, weights: Weights, stop_gradient: str
-    ) -> tuple[Tensor, Tensor]:
+    def add_divergence_slope(self, slope: tuple[Tensor, Tensor] | None, weights: Weights) -> tuple[Tensor, Tensor]:
         by_means, by_log_std = slope or self._no_slope()
         weights = weights.unsqueeze(-1) if isinstance(weights, Tensor) else weights
         gap, log_ratio = self._gap(slice(1, None), slice(1))
@@ -223,10 +218,8 @@ class GaussianPolicies(Policies):
         if len(self._item[0]) > 1:
             self._add_by_items(by_log_std, excess, slice(1, None))
         weighted.mul_(self._of(self._precision, slice(1)))
-        if stop_gradient != "transformed":
-            by_means[:, 1:].add_(weighted)
-        if stop_gradient != "original":
-            by_means[:, :1].sub_(weighted.sum(1, keepdim=True))
+        by_means[:, 1:].add_(weighted)
+        by_means[:, :1].sub_(weighted.sum(1, keepdim=True))
         return by_means, by_log_std
 
     def back(self, slope: tuple[Tensor, Tensor]) -> list[tuple[WithVJP, Tensor]]:

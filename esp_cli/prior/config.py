@@ -45,9 +45,6 @@ class PriorConfig(Strict):
         "sampled",
         description="off-policy learners: copies are made of drawn batches, or stored in the replay (paper: stored)",
     )
-    stop_gradient: Literal["none", "original", "transformed"] = Field(
-        "none", description="which side of the consistency losses is held fixed; authors' code: none"
-    )
 
     fade: float = Field(
         0.0, ge=0, le=1, description="share of the run over which what is not certain falls to 0, linearly; 0: it stays"
@@ -125,7 +122,7 @@ def of_no_use_to(kind: str) -> frozenset[str]:
     """Return the names of settings that change nothing in a prior of this kind."""
     unused = {
         "none": frozenset(PriorConfig.model_fields),
-        "augment": frozenset({"consistency_coef", "terms", "stop_gradient"}),
+        "augment": frozenset({"consistency_coef", "terms"}),
         "consistency": frozenset({"old_log_prob", "replay"}),
     }
     return unused.get(kind, frozenset())

@@ -129,15 +129,15 @@ class Copies(Generic[Rows]):
         return {name: gap.value for name, gap in self._gaps(policy, value).items()}
 
     def _gaps(self, policy: tuple[Any, Any] | None, value: Any) -> dict[str, Loss]:
-        stop, gaps, rows = self.config.stop_gradient, dict[str, Loss](), self.originals
+        gaps, rows = dict[str, Loss](), self.originals
         if policy is not None and hasattr(policy[0], "policies"):
-            gaps["policy"] = Loss(Term(self.policies(*policy), 1.0, policy_gap(rows.mask, stop)))
+            gaps["policy"] = Loss(Term(self.policies(*policy), 1.0, policy_gap(rows.mask)))
         elif policy is not None:
             head, outputs = policy[0], self.frame.pull_outputs(policy[1])
-            gap = policy_consistency_loss(head.divergence, outputs[:, 1:], outputs[:, :1], stop).flatten(2)
+            gap = policy_consistency_loss(head.divergence, outputs[:, 1:], outputs[:, :1]).flatten(2)
             gaps["policy"] = Loss.of(average(gap, shares(rows.mask, gap.shape)))
         if value is not None:
-            gaps["value"] = Loss(Term(self.values(value), 1.0, value_gap(rows.valued(_returned(value).size[-1]), stop)))
+            gaps["value"] = Loss(Term(self.values(value), 1.0, value_gap(rows.valued(_returned(value).size[-1]))))
         return gaps
 
 

@@ -174,48 +174,35 @@ def _itself(on: OfGraph, weight: float, slope: Tensor | None) -> Stated:
     return Stated(lambda: on.tensor, None, own if slope is None else slope + own)
 
 
-def policy_consistency_loss(
-    divergence: Callable[[Any, Any], Tensor], pulled_back: Any, original: Any, stop_gradient: str = "none"
-) -> Tensor:
+def policy_consistency_loss(divergence: Callable[[Any, Any], Tensor], pulled_back: Any, original: Any) -> Tensor:
     """Return S_pi = KL[pi(K_g . | L_g s) || pi(. | s)] (Eq. 8), [S, B, N].
 
     Args:
         divergence: KL of two distributions given by their outputs, as a policy head defines it.
         pulled_back: outputs [S, B, N, A] of the policy at L_g s, pulled back by K_g: action a has the weight of K_g a.
         original: outputs of the policy at s.
-        stop_gradient: "original" or "transformed" holds that side fixed, "none" lets both move.
     """
-    pulled_back, original = _stopped(pulled_back, original, stop_gradient)
     return divergence(pulled_back, original)
 
 
-def value_consistency_loss(transformed: Tensor, original: Tensor, stop_gradient: str = "none") -> Tensor:
+def value_consistency_loss(transformed: Tensor, original: Tensor) -> Tensor:
     """Return S_V = (V(s) - V(L_g s))^2 (Eq. 9) of values [S, B, C] in the critic's own (normalised) units."""
-    transformed, original = _stopped(transformed, original, stop_gradient)
     return (original - transformed).square()
 
 
-def _stopped(transformed: Any, original: Any, stop_gradient: str) -> tuple[Any, Any]:
-    if stop_gradient == "original":
-        return transformed, original.detach()
-    if stop_gradient == "transformed":
-        return transformed.detach(), original
-    return transformed, original
-
-
-def policy_gap(mask: Tensor | None, stop_gradient: str) -> Equation:
+def policy_gap(mask: Tensor | None) -> Equation:
     """Return the mean of S_pi over copies and rows that count, as an equation on `networks.policies.Policies`."""
 
     def equation(policies: Any, weight: float, slope: Any) -> Stated:
         num_seeds, num_parts, num_rows = policies.sizes
         share = shares(mask, (num_seeds, num_parts - 1, num_rows))
-        slope = policies.add_divergence_slope(slope, weight * share, stop_gradient)
+        slope = policies.add_divergence_slope(slope, weight * share)
         return Stated(lambda: policy_consistency_loss(policies.divergence, slice(1, None), slice(0, 1)), share, slope)
 
     return equation
 
 
-def value_gap(mask: Tensor | None, stop_gradient: str) -> Equation:
+def value_gap(mask: Tensor | None) -> Equation:
     """Return the mean of S_V (S_Q) over copies and rows that count, as an equation on `Values`."""
 
     def equation(values: Values, weight: float, slope: Tensor | None) -> Stated:
@@ -226,13 +213,11 @@ def value_gap(mask: Tensor | None, stop_gradient: str) -> Equation:
             return value_consistency_loss(values.rows[:, 1:], values.rows[:, :1])
 
         if not (slope is None or isinstance(slope, Tensor)):
-            return Stated(stated, share, slope.with_gap(weight * share, stop_gradient))
+            return Stated(stated, share, slope._replace(gap_weight=weight * share))
         slope = torch.zeros_like(values.rows) if slope is None else slope
         by_copies = (values.rows[:, 1:] - values.rows[:, :1]).mul_(2 * weight * share)
-        if stop_gradient != "transformed":
-            slope[:, 1:].add_(by_copies)
-        if stop_gradient != "original":
-            slope[:, :1].sub_(by_copies if by_copies.shape[1] == 1 else by_copies.sum(1, keepdim=True))
+        slope[:, 1:].add_(by_copies)
+        slope[:, :1].sub_(by_copies if by_copies.shape[1] == 1 else by_copies.sum(1, keepdim=True))
         return Stated(stated, share, slope)
 
     return equation

@@ -54,14 +54,14 @@ def reference_loss(trained, made, entropy_coef):
     loss = loss - mean_per_seed(objective, batch.mask)
     if not transformed or not prior.coefficient:
         return loss
-    stop, gaps = prior.stop_gradient, []
+    gaps = []
     (here, *there), (value, *moved) = (x.split(made.originals.count, 1) for x in (outputs, values))
     for g, copy, of_copy in zip(made.transforms, there, moved, strict=True):
         if prior.terms != "value":
-            gap = policy_consistency_loss(head.divergence, g.pull_back(copy), here, stop)
+            gap = policy_consistency_loss(head.divergence, g.pull_back(copy), here)
             gaps.append(mean_per_seed(gap, made.originals.mask))
         if prior.terms != "policy":
-            gap = value_consistency_loss(g.values(of_copy), value, stop)
+            gap = value_consistency_loss(g.values(of_copy), value)
             gaps.append(mean_per_seed(gap, made.originals.valued(trained.num_values)))
     return loss + prior.coefficient * sum(gaps) / len(made.transforms)
 
@@ -109,8 +109,7 @@ CHOICES = [
     {"prior__kind": "esp", "prior__copies": "all", "prior__transforms": "c4"},
     {"prior__kind": "augment", "prior__transforms": "rot90"},
     {"prior__kind": "consistency", "prior__consistency_coef": 3.0},
-    {"prior__kind": "esp", "prior__stop_gradient": "original", "prior__consistency_coef": 3.0},
-    {"prior__kind": "esp", "prior__stop_gradient": "transformed", "prior__copies": "all"},
+    {"prior__kind": "esp", "prior__copies": "all", "prior__consistency_coef": 3.0},
     {"prior__kind": "consistency", "prior__terms": "policy"},
     {"prior__kind": "consistency", "prior__terms": "value"},
     {"prior__kind": "esp", "network__name": "gru", "mappo__critic_input": "own"},
@@ -118,8 +117,8 @@ CHOICES = [
     {"prior__kind": "none", **CONTINUOUS},
     {"prior__kind": "esp", **CONTINUOUS},
     {"prior__kind": "esp", "prior__transforms": "o2", "prior__consistency_coef": 3.0, **CONTINUOUS},
-    {"prior__kind": "esp", "prior__copies": "all", "prior__stop_gradient": "original", **CONTINUOUS},
-    {"prior__kind": "consistency", "prior__stop_gradient": "transformed", **CONTINUOUS},
+    {"prior__kind": "esp", "prior__copies": "all", **CONTINUOUS},
+    {"prior__kind": "consistency", **CONTINUOUS},
     {"prior__kind": "augment", "network__name": "gru", **CONTINUOUS},
     {"mappo__clip_value": True},
     {"mappo__clip_value": True, "prior__kind": "augment", "prior__old_log_prob": "recompute"},

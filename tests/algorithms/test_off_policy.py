@@ -120,7 +120,7 @@ def test_every_iteration_logs_what_the_page_promises(algorithm):
     names = (
         "return epsilon augmented_share td_loss value value_symmetry_error "
         + {
-            "maddpg": "critic_grad_norm policy_loss actor_grad_norm entropy policy_symmetry_error critic_idle_units",
+            "maddpg": "critic_grad_norm policy_loss actor_grad_norm entropy policy_symmetry_error",
             "qmix": "grad_norm",
         }[algorithm]
     )
@@ -138,7 +138,7 @@ EVERYTHING = [
     {"task": "predator-prey", "task__control": "prey"},
     {"task__num_agents": 1, "algo__td_lambda": 0.5},
     {"algo__bootstrap_truncated": True, "algo__critic_sees_time": False},
-    {"prior__stop_gradient": "original", "prior__terms": "value", "network__layer_norm": True},
+    {"prior__terms": "value", "network__layer_norm": True},
 ]
 CONTINUOUS = [
     {"task__actions": "continuous", "prior__transforms": "o2"},

@@ -73,8 +73,6 @@ CASES: dict[str, str] = {
     "a reward each": f"{_NAVIGATION} --transforms d2*agents --set task.convention=pettingzoo",
     "sampled rotations, forces": f"{_NAVIGATION} --transforms so2 --set task.actions=continuous --seeds 2",
     "sampled rotations and reflections": f"{_NAVIGATION} --transforms o2*agents --set task.actions=continuous",
-    "originals held fixed": f"{_NAVIGATION} --set prior.stop_gradient=original",
-    "copies held fixed": f"{_NAVIGATION} --set prior.stop_gradient=transformed --set prior.copies=all",
     "clipped values, recomputed": (
         f"{_NAVIGATION} --set mappo.clip_value=true --set prior.old_log_prob=recompute --transforms d4*agents"
     ),
@@ -97,10 +95,6 @@ CASES: dict[str, str] = {
     "maddpg, stored copies": (
         f"--task navigation --network mlp --algo maddpg {_OFF_POLICY} --transforms rot90"
         " --set prior.replay=stored --set maddpg.actor_actions=own"
-    ),
-    "maddpg, forces, agents permuted": (
-        f"--task navigation --network mlp --algo maddpg {_OFF_POLICY} --set task.actions=continuous"
-        " --transforms o2*agents --set prior.stop_gradient=transformed"
     ),
     "maddpg, a reward each": (
         f"--task navigation --network mlp --algo maddpg {_OFF_POLICY} --set task.convention=pettingzoo"

@@ -75,20 +75,6 @@ def test_bfloat16_products_stay_near_float32_and_keep_float32_gradients():
     assert all(p.grad.dtype == torch.float32 for p in half.parameters())
 
 
-def test_idle_units_by_hand():
-    """One input; units wake where w x + b > 0."""
-    mlp = SeedMLP(generators(0, 1), (1, 4, 2, 1), "relu", 1.0)
-    first, second, _ = mlp.layers
-    first.weight.data.copy_(torch.tensor([[[1.0, -1, 1, 0]], [[1.0, 1, 1, 1]]]))
-    first.bias.data.copy_(torch.tensor([[[0.0, 0, -5, 0]], [[0.0, 0, 0, 0]]]))
-    second.weight.data.fill_(1.0)
-    second.bias.data.copy_(torch.tensor([[[-3.0, 0]], [[-3.0, -9]]]))
-    x = torch.tensor([[[2.0], [-1.0]], [[1.0], [2.0]]])
-    # seed 0: of the first layer the third (-5) and the fourth (0) stay idle, of the second the one that lacks 1;
-    # seed 1: of the second layer the one that lacks 1
-    torch.testing.assert_close(mlp.idle_units(x), torch.tensor([3 / 6, 1 / 6]))
-
-
 def test_weights_are_orthogonal_and_a_seed_draws_the_same_alone_and_among_others():
     weights = orthogonal(generators(3, 4), 10, 6, 2.0)
     identity = weights.transpose(1, 2) @ weights / 4.0

@@ -44,15 +44,6 @@ def test_value_consistency_is_the_squared_gap():
 
 
 @pytest.mark.parametrize(
-    ("stop", "moves"), [("none", (True, True)), ("original", (True, False)), ("transformed", (False, True))]
-)
-def test_stop_gradient_holds_the_side_that_it_names(stop, moves):
-    transformed, original = torch.tensor([1.0], requires_grad=True), torch.tensor([3.0], requires_grad=True)
-    value_consistency_loss(transformed, original, stop).sum().backward()
-    assert tuple(x.grad is not None for x in (transformed, original)) == moves
-
-
-@pytest.mark.parametrize(
     ("kind", "augments", "coefficient", "active"),
     [
         ("esp", True, 0.1, True),

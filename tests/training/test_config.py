@@ -118,6 +118,7 @@ def test_the_choice_of_terms_is_named_for_a_learner_that_has_one_of_them_alone(a
 
 GONE = [
     ("task_settings", {"prey_policy": None, "prey_policy_seed": 0, "learned_prey": 0.0}, {"learned_prey": 0.5}),
+    ("prior", {"stop_gradient": "none"}, {"stop_gradient": "original"}),
 ]
 """By part of a configuration, settings that went: as earlier versions stored them, and one that they acted on."""
 

@@ -18,7 +18,7 @@ struct Choices {
 
 // What losses add to the slope by the outputs. No data: they do not, or the weight is a number.
 struct Slope {
-    int64_t learned, moves_copies, moves_originals, old_parts;
+    int64_t learned, moves, old_parts;
     float entropy_weight, gap_weight, clip, clip_weight;
     const int64_t *action;                                     // [S, R]
     const float *by_log_prob, *entropy_weights, *gap_weights;  // [S, L, R], [S, R], [S, R]
@@ -114,8 +114,8 @@ void back_part(const Batch &batch, const Slope &slope, int64_t part, const Vec *
         by[a] = Vec{};
         if (learned) by[a] -= log_prob[a] * prob[a] * entropies;
         if (learned) by[a] += taken == static_cast<int32_t>(a) ? by_log_prob : Vec{};
-        if (part > 0 && slope.moves_copies) by[a] += prob[a] * (log_prob[a] - known[a]) * gaps;
-        for (int64_t k = 1; part == 0 && slope.moves_originals && k < of.parts; k++)
+        if (part > 0 && slope.moves) by[a] += prob[a] * (log_prob[a] - known[a]) * gaps;
+        for (int64_t k = 1; part == 0 && slope.moves && k < of.parts; k++)
             by[a] -= known[k * step + of.actions + a] * gaps;
         total += by[a];
     }

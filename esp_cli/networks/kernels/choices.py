@@ -23,7 +23,7 @@ class _Choices(ctypes.Structure):
 
 class _Slope(ctypes.Structure):
     _fields_ = (
-        *fields(ctypes.c_int64, "learned", "moves_copies", "moves_originals", "old_parts"),
+        *fields(ctypes.c_int64, "learned", "moves", "old_parts"),
         *fields(ctypes.c_float, "entropy_weight", "gap_weight", "clip", "clip_weight"),
         *fields(ctypes.c_void_p, "action", "by_log_prob", "entropy_weights", "gap_weights"),
         *fields(ctypes.c_void_p, "old", "advantage", "clip_weights"),
@@ -57,7 +57,7 @@ class Slope(NamedTuple):
     # actions of S R rows, the slope by their log-probabilities [S, L, R] and that by entropies, a number or [S, 1, R]
     chosen: tuple[Tensor, Tensor, Tensor | float] | None = None
     clipped: Clipped | None = None  # instead of `chosen`
-    gaps: tuple[Tensor | float, str] | None = None  # weights, a number or [S, 1, R], and which side is held fixed
+    gaps: Tensor | float | None = None  # weights, a number or [S, 1, R]
 
     def asked(self) -> _Slope:
         """Return what the kernel is asked for; it keeps the tensors that it points at."""
@@ -81,9 +81,8 @@ class Slope(NamedTuple):
             asked.clip_weight, asked.clip_weights = weight(clipped.weight)
             asked.entropy_weight, asked.entropy_weights = weight(clipped.entropy_weight)
         if self.gaps is not None:
-            weights, fixed = self.gaps
-            asked.gap_weight, asked.gap_weights = weight(weights)
-            asked.moves_copies, asked.moves_originals = fixed != "transformed", fixed != "original"
+            asked.gap_weight, asked.gap_weights = weight(self.gaps)
+            asked.moves = True
         asked.kept = kept
         return asked
 

@@ -5,7 +5,7 @@
 // What values.py fills in: Huber losses of the first parts of rows [R, P], and squared gaps between each copy and the
 // original.
 struct Regression {
-    int64_t learned, moves_copies, moves_originals;
+    int64_t learned;
     float delta, weight, gap_weight;
     const float *target;  // [S, R]
 };
@@ -45,10 +45,10 @@ void learn_values(const Perceptron *given, const Regression *of, float *by_param
             for (int64_t k = 0; k < parts; k++) {
                 float value = outputs[k * width], gap = of->gap_weight * 2 * (value - original);
                 float error = std::clamp(value - target[r], -of->delta, of->delta);
-                outputs[k * width] = (k < of->learned ? of->weight * error : 0) + (of->moves_copies ? gap : 0);
+                outputs[k * width] = (k < of->learned ? of->weight * error : 0) + gap;
                 gaps += gap;
             }
-            if (of->moves_originals) outputs[0] -= gaps;
+            outputs[0] -= gaps;
         }
     });
 }

@@ -13,7 +13,7 @@ from esp_cli.networks.kernels.perceptron import LearningPass
 
 class _Regression(ctypes.Structure):
     _fields_ = (
-        *fields(ctypes.c_int64, "learned", "moves_copies", "moves_originals"),
+        *fields(ctypes.c_int64, "learned"),
         *fields(ctypes.c_float, "delta", "weight", "gap_weight"),
         ("target", ctypes.c_void_p),
     )
@@ -27,13 +27,8 @@ class Regression(NamedTuple):
     delta: float
     weight: float
     gap_weight: float = 0.0
-    fixed: str = "none"  # which side of the gap; see `PriorConfig.stop_gradient`
-
-    def with_gap(self, weight: float, fixed: str) -> Regression:
-        return self._replace(gap_weight=weight, fixed=fixed)
 
     def learn(self, run: LearningPass) -> Tensor:
         """Return the gradients [S, P] by the parameters of a perceptron whose only output are the values."""
-        target, sides = self.target.contiguous(), (self.fixed != "transformed", self.fixed != "original")
-        numbers = (self.delta, self.weight, self.gap_weight)
-        return run.learn("perceptron", "learn_values", _Regression(self.learned, *sides, *numbers, target.data_ptr()))
+        target, numbers = self.target.contiguous(), (self.delta, self.weight, self.gap_weight)
+        return run.learn("perceptron", "learn_values", _Regression(self.learned, *numbers, target.data_ptr()))
