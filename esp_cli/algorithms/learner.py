@@ -195,10 +195,6 @@ class Learner(ABC):
         """Whether it took any gradient step; one that first fills a replay may not have."""
         return True
 
-    def bytes_to_come(self, steps: int) -> int:
-        """Return by how many bytes the state of a run will grow over its steps per seed: by what a replay collects."""
-        return 0
-
     def seed_tensors(self) -> list[Tensor]:
         """Return every tensor with a leading seed axis that learning changes: weights, statistics, moments."""
         out = [tensor for module in self.modules.values() for tensor in module.state_dict().values()]

@@ -203,10 +203,6 @@ class OffPolicyLearner(Learner):
     def has_learned(self) -> bool:
         return self.updates > 0
 
-    def bytes_to_come(self, steps: int) -> int:
-        episodes = min(self.replay.capacity, steps // self.spec.horizon * (1 + self.prior.num_stored))
-        return self.replay.num_bytes * max(0, episodes - self.replay.size) // self.replay.capacity
-
     def state_dict(self, complete: bool = False) -> dict[str, Tensor]:
         out = super().state_dict(complete) | {"counters": torch.tensor([self.episodes, self.updates])}
         replay = {} if complete else self.replay.state_dict()

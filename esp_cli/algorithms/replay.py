@@ -84,11 +84,6 @@ class EpisodeReplay:
             alive=room(steps + 1, agents, dtype=torch.bool) if spec.agents_end else None,
         )
 
-    @property
-    def num_bytes(self) -> int:
-        """Memory of the whole store."""
-        return sum(tensor.nbytes for tensor in self._store.tensors.values())
-
     def add(self, episodes: EpisodeBatch) -> None:
         """Store episodes; the oldest give way."""
         count = episodes.obs.shape[1]

@@ -127,8 +127,5 @@ class RolesLearner(Learner):
     def has_learned(self) -> bool:
         return all(learner.has_learned for learner in self.each.values())
 
-    def bytes_to_come(self, steps: int) -> int:
-        return sum(learner.bytes_to_come(steps) for learner in self.each.values())
-
     def seed_tensors(self) -> list[Tensor]:
         return [tensor for learner in self.each.values() for tensor in learner.seed_tensors()]

@@ -135,7 +135,7 @@ def _print(exported: Exported, title: str, out: Path) -> None:
             console.note(result.note)
     headings = ("format", "files", "bytes>", "observations>", "largest difference>", "other choices>")
     console.table(headings, rows, title=title, caption="compared with the policy itself, in float32")
-    costs: list[tuple[str, object]] = [("parameters", exported.parameters), ("operations an action", exported.flops)]
+    costs: list[tuple[str, object]] = [("parameters", exported.parameters)]
     if exported.c is not None:
         costs += [("flash of the C source, bytes", f"{exported.c.flash_bytes} and about 1 kB of code")]
         costs += [("RAM of the C source, bytes", exported.c.ram_bytes)]

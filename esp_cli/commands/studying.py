@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -32,7 +31,6 @@ if TYPE_CHECKING:
     from esp_cli.studies.study import Study, StudyFolder
 
 BUSY = 0.5  # load per core from which a forecast is called unreliable
-_MEBIBYTE = 2**20
 
 
 @dataclass(frozen=True)
@@ -127,7 +125,7 @@ def measuring(total: int) -> Iterator[Callable[[int], object]]:
 
 
 def print_forecast(found: Forecast, json: str | None, what: str) -> None:
-    """Print `what` is left to do, such as "2 runs to do", how long it takes, and whether the disk has room for it."""
+    """Print `what` is left to do, such as "2 runs to do" and how long it takes."""
     rows = [
         (
             run.name,
@@ -138,19 +136,12 @@ def print_forecast(found: Forecast, json: str | None, what: str) -> None:
         for run in found.runs
     ]
     core, side_by_side = map(console.format_duration, (found.core_seconds, found.seconds))
-    done, peak = (size / _MEBIBYTE for size in (found.disk_bytes, found.disk_peak_bytes))
-    free = shutil.disk_usage(next(p for p in (found.out, *found.out.absolute().parents) if p.exists())).free / _MEBIBYTE
 
     def show() -> None:
         console.table(("run", "steps x seeds>", "state", "time left>"), rows, title=found.title)
         console.say(
             f"{what}: {core} on one core, {side_by_side} with {found.jobs} side by side, if nothing else runs here"
         )
-        console.say(
-            f"disk: {done:.0f} MiB when done, at most {peak:.0f} MiB on the way; {free:.0f} MiB are free -> {found.out}"
-        )
-        if peak > free:
-            console.note("the disk is too small for that; choose another --out, or fewer --jobs")
 
     console.result(json, found, show)
 

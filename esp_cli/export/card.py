@@ -40,7 +40,6 @@ def describe(trained: TrainedPolicy, program: Program, sample: Sample) -> dict[s
             "step": trained.step,
             "network": program.describe(),
             "parameters": program.num_parameters,
-            "flops_per_action": program.flops,
             **std,
         },
         **({"robot": dict(robot)} if robot else {}),

@@ -74,7 +74,6 @@ class Exported:
 
     formats: tuple[Export, ...]
     parameters: int  # learned numbers
-    flops: int  # operations for one action
     c: c_file.Cost | None  # flash and RAM of the C source, where it was written
 
 
@@ -120,7 +119,7 @@ def export(trained: TrainedPolicy, formats: Sequence[str], folder: Path, force: 
     written["README.md"] = _readme(job, results)
     _write(written, folder, force, formats)
     program = job.program
-    return Exported(results, program.num_parameters, program.flops, c_file.cost(program) if "c" in formats else None)
+    return Exported(results, program.num_parameters, c_file.cost(program) if "c" in formats else None)
 
 
 def _job(trained: TrainedPolicy, formats: Sequence[str]) -> Job:

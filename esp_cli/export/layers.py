@@ -33,7 +33,6 @@ class Layer:
     """
 
     kind: str  # its name in JSON
-    flops: int  # for one row: each addition, multiplication, comparison or call of tanh, exp or sqrt is one
     c: str
     torch: Callable[[Tensor, list[Tensor], Any], Tensor]
     arrays: tuple[Floats, ...] = ()  # learned numbers, in the order in which exports store them
@@ -51,7 +50,6 @@ def affine(weight: Floats, bias: Floats) -> Layer:
     inputs, outputs = weight.shape
     return Layer(
         "affine",
-        flops=2 * weight.size,
         c=f"EACH affine(w0, w1, {inputs}, {outputs}, X, Y);\nSWAP;",
         torch=lambda x, w, _: torch.addmm(w[1], x, w[0]),
         arrays=(weight, bias),
@@ -63,7 +61,6 @@ def norm(weight: Floats, bias: Floats) -> Layer:
     """Return (x - mean) / sqrt(variance + 1e-5) * weight + bias over a row."""
     return Layer(
         "norm",
-        flops=8 * weight.size,  # a number: sums for mean and variance (1 + 3), then four operations
         c=f"EACH normalise(w0, w1, {weight.size}, X);",
         torch=lambda x, w, _: F.layer_norm(x, x.shape[-1:], w[0], w[1], NORM_EPSILON),
         arrays=(weight, bias),
@@ -74,7 +71,6 @@ def activation(kind: Literal["relu", "tanh"], width: int) -> Layer:
     """Return relu or tanh of every number of a row."""
     return Layer(
         kind,
-        flops=width,
         c=f"EACH apply_{kind}(X, {width});",
         torch=lambda x, *_: torch.relu(x) if kind == "relu" else torch.tanh(x),
         numbers=(("width", width),),
@@ -97,8 +93,6 @@ def gru(weight: Floats, bias: Floats, hidden_weight: Floats, hidden_bias: Floats
 
     return Layer(
         "gru",
-        # per number two sigmoids (four operations each, sums included), tanh and the interpolation
-        flops=2 * (weight.size + hidden_weight.size) + 14 * size,
         c=f"""
             affine(w0, w1, {len(weight)}, 3 * {size}, x, into);
             affine(w2, w3, {size}, 3 * {size}, memory, back);
@@ -113,7 +107,6 @@ def cut(begin: int, end: int) -> Layer:
     """Return columns `begin` to `end` of a row."""
     return Layer(
         "slice",
-        flops=0,
         c=f"EACH memmove(X, X + {begin}, sizeof(float) * ({end} - {begin}));",
         torch=lambda x, *_: x[:, begin:end],
         numbers=(("begin", begin), ("end", end)),
@@ -127,7 +120,6 @@ def convolution(weight: Floats, bias: Floats, shape: tuple[int, int, int], side:
     filters = (outputs, channels, side, side)
     return Layer(
         "convolution",
-        flops=2 * weight.size * high * wide,
         c=f"EACH convolve(w0, w1, {channels}, {rows}, {columns}, {side}, {stride}, {outputs}, X, Y);\nSWAP;",
         torch=lambda x, w, _: F.conv2d(x.unflatten(1, shape), w[0].T.reshape(filters), w[1], stride).flatten(1),
         arrays=(weight, bias),
@@ -145,7 +137,6 @@ def global_max_pool(channels: int, places: int) -> Layer:
     """Return the largest number of each channel: [channels x places] to [channels]."""
     return Layer(
         "global_max_pool",
-        flops=channels * (places - 1),
         c=f"EACH global_max_pool({channels}, {places}, X, Y);\nSWAP;",
         torch=lambda x, *_: x.unflatten(1, (channels, places)).amax(2),
         numbers=(("channels", channels), ("places", places)),
@@ -171,8 +162,6 @@ def aggregate(begin: int, team: int, width: int, reach_squared: float) -> Layer:
 
     return Layer(
         "aggregate",
-        # per other agent: distance (3), comparison, count, and two operations per number of position and features
-        flops=others * (9 + 2 * width) + 4,
         c=f"aggregate(observation + {begin}, {width}, {literal(reach_squared)}, {literal(reach)}, x, y);\nSWAP;",
         torch=hear,
         numbers=(("begin", begin), ("team", team), ("width", width), ("reach_squared", reach_squared)),

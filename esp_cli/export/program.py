@@ -69,11 +69,6 @@ class Program:
     def num_parameters(self) -> int:
         return len(self.weights) // 4
 
-    @property
-    def flops(self) -> int:
-        own = self.num_outputs if self.head == "choose" else 5 * self.num_outputs
-        return sum(layer.flops for layer in self.layers) + own
-
     def split(self, obs: Floats) -> tuple[Floats, dict[str, Floats]]:
         """Return what the program reads of a task's observations [B, D]: own numbers [B, d], tables [B, K, W]."""
         return (obs[:, self.own] if self.sets else obs), {name: obs[:, columns] for name, columns in self.sets}

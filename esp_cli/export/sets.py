@@ -84,7 +84,6 @@ def pool_sets(
 
     return Layer(
         "sets",
-        flops=sum(2 * w.size for w in own) + _flops(sets, features),
         c=_c(sets, bool(own), kept, inputs, beside, near, kind),
         torch=pooled,
         arrays=(*own, *(array for each in sets for array in each.arrays)),
@@ -99,18 +98,6 @@ def pool_sets(
         width=max(inputs + beside, outputs),
         scratch=len(kept) + 3 * features + widest + sum(near * each.width for each in sets if each.place is not None),
     )
-
-
-def _flops(sets: Sequence[SetOf], features: int) -> int:
-    """Return the operations that embed the things of all sets, and the own numbers once for each set."""
-    located = sum(each.place is not None for each in sets)
-    others = sum(len(other.columns) for other in sets if other.place is not None)
-    of_things = (
-        len(each.columns)
-        * (sum(2 * w.size for w in (each.arrays[0], each.arrays[3])) + 6 * features + 6 * others * bool(located))
-        for each in sets
-    )
-    return sum(of_things) + sum(2 * each.arrays[1].size for each in sets)
 
 
 def _each(things: Tensor, weight: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""What a study or a search still costs on this machine: seconds by a short probe of each run, and bytes on the disk."""
+"""What a study or a search still costs on this machine: seconds by a short probe of each run."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from pathlib import Path
 
 import torch
 
-from esp_cli.algorithms.learner import Learner
 from esp_cli.studies.scheduler import Status, makespan
 from esp_cli.studies.study import StudyFolder
 from esp_cli.studies.tuning import Tuning
@@ -22,7 +21,6 @@ from esp_envs.registry import task_class
 PROBE_SECONDS = 1.0  # for which iterations of a run are timed, after a first that is not
 _LONG_SECONDS = 3.0  # an iteration that takes as long is measured once
 _PROBED_EPISODES = 8  # of an evaluation, at most; longer ones take their share more
-_CHECKPOINTS = 3  # two are kept while a third is written
 _POLICIES = 3  # a final evaluation plays greedily, with drawn actions, at random, and with each heuristic of the task
 
 
@@ -32,8 +30,6 @@ class Cost:
 
     training_s: float  # for all of its steps, evaluations included
     evaluation_s: float  # for its final evaluation
-    disk_bytes: int  # of what stays when it is done
-    peak_bytes: int  # of what lies on the disk at most while it trains
 
 
 @dataclass(frozen=True)
@@ -46,8 +42,6 @@ class RunForecast:
     step: int  # those that are done
     num_seeds: int
     seconds: float  # that are left, on one thread
-    disk_bytes: int
-    peak_bytes: int
 
 
 @dataclass(frozen=True)
@@ -59,8 +53,6 @@ class Forecast:
     jobs: int  # runs side by side
     seconds: float  # until the last run ends, where `jobs` run side by side and nothing else does
     core_seconds: float  # of all runs added up
-    disk_bytes: int  # of the folder when all is done
-    disk_peak_bytes: int  # at most, where the `jobs` runs that need most on the way end together
     runs: tuple[RunForecast, ...]  # in the order in which they are begun
 
 
@@ -71,19 +63,13 @@ def forecast_study(
     known, runs, cells = dict[str, Cost](), list[RunForecast](), folder.study.cells
     for k, cell in enumerate(cells):
         config, step = cell.config, folder.progress(cell)[0]
-        twin = folder.run_path(cell) if folder.is_finished(cell) else folder.find_twin(cell, others)
-        if twin is not None:
-            disk = peak = sum(file.stat().st_size for file in twin.rglob("*") if file.is_file())
+        done = folder.is_finished(cell) or folder.find_twin(cell, others) is not None
+        if done or (not step and any(config == earlier.config for earlier in cells[:k])):
+            runs.append(RunForecast(cell.name, "finished", config.steps, config.steps, len(config.seeds), 0))
         else:
             cost = _cost(config, folder.study.episodes, known)
-            disk, peak = cost.disk_bytes, cost.peak_bytes
-        if twin is not None or (not step and any(config == earlier.config for earlier in cells[:k])):
-            runs.append(
-                RunForecast(cell.name, "finished", config.steps, config.steps, len(config.seeds), 0, disk, disk)
-            )
-        else:
             left = cost.training_s * (1 - step / config.steps) + cost.evaluation_s
-            runs.append(RunForecast(cell.name, "waiting", config.steps, step, len(config.seeds), left, disk, peak))
+            runs.append(RunForecast(cell.name, "waiting", config.steps, step, len(config.seeds), left))
         listener(len(runs))
     seconds = makespan([], [run.seconds for run in runs if run.status != "finished"], jobs)
     return _added_up(folder.study.title, folder.path, jobs, seconds, runs)
@@ -115,18 +101,14 @@ def forecast_tuned(
     for name, configs in pairs.items():
         trial, last = (_cost(config, episodes, known) for config in configs)
         seconds = trials * trial.training_s + judged * (last.training_s + last.evaluation_s)
-        disk = trials * trial.disk_bytes + judged * last.disk_bytes
-        peak = disk + max(one.peak_bytes - one.disk_bytes for one in (trial, last))
         steps, count = configs[0].steps, len(configs[0].seeds)
-        runs.append(RunForecast(name, "waiting", steps, 0, count, seconds, disk, peak))
+        runs.append(RunForecast(name, "waiting", steps, 0, count, seconds))
         listener(len(runs))
     return _added_up(title, out, jobs, sum(run.seconds for run in runs) / jobs, runs)
 
 
 def _added_up(title: str, out: Path, jobs: int, seconds: float, runs: Sequence[RunForecast]) -> Forecast:
-    core, disk = sum(run.seconds for run in runs), sum(run.disk_bytes for run in runs)
-    extra = sorted((run.peak_bytes - run.disk_bytes for run in runs), reverse=True)
-    return Forecast(title, out, jobs, seconds, core, disk, disk + sum(extra[:jobs]), tuple(runs))
+    return Forecast(title, out, jobs, seconds, sum(run.seconds for run in runs), tuple(runs))
 
 
 def _cost(config: RunConfig, episodes: int, known: dict[str, Cost]) -> Cost:
@@ -151,12 +133,12 @@ def measure(config: RunConfig, episodes: int) -> Cost:
         iterations = -(-config.steps // learner.steps_per_iteration)
         clock, done = _clock(config), 0
         begun = clock()
-        metrics = learner.iterate(0.0).metrics
+        learner.iterate(0.0)
         per_iteration = clock() - begun
         if per_iteration < _LONG_SECONDS:  # else the warm-up of the first is lost in it
             begun = clock()
             while done == 0 or (clock() - begun < PROBE_SECONDS and done < iterations):
-                metrics = learner.iterate(done / iterations).metrics
+                learner.iterate(done / iterations)
                 done += 1
             per_iteration = (clock() - begun) / done
         side_by_side = min(config.evaluation.episodes, _PROBED_EPISODES)
@@ -168,14 +150,9 @@ def measure(config: RunConfig, episodes: int) -> Cost:
     finally:
         torch.set_num_threads(threads)
     evaluations = 1 + config.steps // config.evaluation.every_steps
-    weights = sum(tensor.nbytes for tensor in learner.policy.state_dict().values())
-    row = len(json.dumps({name: value.tolist() for name, value in metrics.items()}))
-    kept = weights + _bytes(learner, complete=True) + iterations * row
     return Cost(
         training_s=iterations * per_iteration + evaluations * 2 * config.evaluation.episodes * per_episode,
         evaluation_s=(_POLICIES + len(task_class(config.task).heuristics)) * episodes * per_episode,
-        disk_bytes=kept,
-        peak_bytes=kept + _CHECKPOINTS * (_bytes(learner) + learner.bytes_to_come(config.steps)),
     )
 
 
@@ -186,7 +163,3 @@ def _clock(config: RunConfig) -> Callable[[], float]:
     """
     alone = config.device == "cpu" and not multiprocessing.active_children()
     return time.process_time if alone else time.monotonic
-
-
-def _bytes(learner: Learner, complete: bool = False) -> int:
-    return sum(tensor.nbytes for tensor in learner.state_dict(complete).values())

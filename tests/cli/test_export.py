@@ -16,7 +16,7 @@ from tests.cli.running import esp, refused
 def test_the_best_seed_of_a_run_goes_out(finished: Path, tmp_path: Path) -> None:
     result = esp("export", finished, "-f", "numpy", "-f", "onnx", "-o", tmp_path / "out", "--episodes", 4)
     assert "is the best of 2 over 4 episodes each" in result.stderr
-    for part in ("policy.py", "policy.onnx", "10000", "operations an action"):
+    for part in ("policy.py", "policy.onnx", "10000", "parameters"):
         assert part in result.stdout
     files = {file.name for file in (tmp_path / "out").iterdir()}
     assert files == {"policy.py", "policy.onnx", "policy.json", "README.md"}

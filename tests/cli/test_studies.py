@@ -60,7 +60,7 @@ def test_a_dry_run_on_a_busy_machine_calls_its_times_unreliable(
     assert ("the times are unreliable" in told.stderr) == unreliable
 
 
-def test_a_dry_run_states_time_and_disk_makes_nothing_and_refuses_what_the_run_refuses(tmp_path: Path) -> None:
+def test_a_dry_run_states_time_makes_nothing_and_refuses_what_the_run_refuses(tmp_path: Path) -> None:
     out, plan = tmp_path / "s", tmp_path / "plan.json"
     assert "is not empty and no study" in refused(*TINY, *TINY_OPTIONS, "--out", Path(__file__).parent, "--dry-run")
     told = esp(*TINY, "--steps", 100, *TINY_OPTIONS, "--out", out, "--dry-run", "--jobs", 2, "--json", plan)
@@ -70,10 +70,8 @@ def test_a_dry_run_states_time_and_disk_makes_nothing_and_refuses_what_the_run_r
     first, second = (run["seconds"] for run in found["runs"])
     assert found["core_seconds"] == pytest.approx(first + second)
     assert found["seconds"] == pytest.approx(max(first, second))
-    assert found["disk_peak_bytes"] > found["disk_bytes"] > 1000
     assert "2 runs to do:" in told.stdout
     assert "with 2 side by side" in told.stdout
-    assert "MiB when done" in told.stdout
 
 
 @pytest.mark.usefixtures("forked_jobs")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import sys
 from pathlib import Path
 
@@ -27,13 +26,11 @@ def test_a_dry_run_states_the_cost_of_equal_budgets_and_makes_nothing(command: l
     told = esp(*command, "--prior", "esp,none", "--budget", 5, "--steps", 300, "--seeds", 2, "--jobs", 3, "--dry-run")
     assert "all trials with the default settings, of which pruning saves about half: " in told.stdout
     assert "with 3 side by side" in told.stdout
-    assert re.search(r"disk: \d+ MiB when done", told.stdout)
     assert not (tmp_path / "t").exists()
     assert "no such folder" in refused(*command, "--steps", 300, "--dry-run", "--reuse", tmp_path / "nowhere")
     planned = json.loads(esp(*command, "--prior", "esp,none", "--steps", 300, "--dry-run", "--json", "-").stdout)
     assert [one["name"] for one in planned["runs"]] == ["30 trials, prior esp", "30 trials, prior none"]
     assert planned["core_seconds"] == pytest.approx(sum(run["seconds"] for run in planned["runs"]))
-    assert planned["disk_bytes"] < planned["disk_peak_bytes"]
 
 
 @pytest.mark.parametrize(

@@ -12,13 +12,9 @@ from esp_cli.studies import forecast as module
 from esp_cli.studies.forecast import Cost, forecast_search
 from esp_cli.studies.forecast import forecast_study as forecast
 from esp_cli.studies.study import StudyFolder
-from esp_cli.training.build import build_learner
-from esp_cli.training.config import resolve_config
 from tests.studies.small_studies import small_study, write_run
 from tests.studies.test_tuning import tuning
 from tests.training.runs import tiny_config
-
-SMALL = {"network.hidden": [8], "evaluation.episodes": 2, "maddpg.num_envs": 2, "maddpg.replay_episodes": 40}
 
 
 @pytest.fixture(autouse=True)
@@ -33,7 +29,7 @@ def probed(monkeypatch) -> list[str]:
 
     def measure(config, episodes):
         seen.append(config.prior.kind)
-        return Cost(training_s=100.0, evaluation_s=4.0, disk_bytes=50, peak_bytes=70)
+        return Cost(training_s=100.0, evaluation_s=4.0)
 
     monkeypatch.setattr(module, "measure", measure)
     return seen
@@ -42,9 +38,9 @@ def probed(monkeypatch) -> list[str]:
 def test_two_new_runs_side_by_side_or_one_after_the_other(tmp_path: Path, probed: list[str]) -> None:
     folder, told = StudyFolder(tmp_path / "s", small_study()), []
     both = forecast(folder, [], 2, told.append)
-    assert (both.seconds, both.core_seconds, both.disk_bytes, both.disk_peak_bytes) == (104.0, 208.0, 100, 140)
+    assert (both.seconds, both.core_seconds) == (104.0, 208.0)
     one = forecast(folder, [], 1, told.append)
-    assert (one.seconds, one.core_seconds, one.disk_bytes, one.disk_peak_bytes) == (208.0, 208.0, 100, 120)
+    assert (one.seconds, one.core_seconds) == (208.0, 208.0)
     assert told == [1, 2, 1, 2]
     assert probed == ["none", "esp"] * 2
     assert not folder.path.exists()
@@ -69,28 +65,25 @@ def test_what_costs_the_same_is_measured_once_and_what_trains_the_same_is_run_on
     assert [run.seconds for run in found.runs].count(104.0) == 8
 
 
-def test_a_finished_run_is_not_measured_and_takes_the_place_that_it_takes(tmp_path: Path, probed: list[str]) -> None:
+def test_a_finished_run_is_not_measured(tmp_path: Path, probed: list[str]) -> None:
     folder = StudyFolder.create(tmp_path / "s", small_study())
     plain = folder.study.cells[0]
     write_run(folder, plain, [[-1.0] * 3], [-1.0] * 3)
-    size = sum(file.stat().st_size for file in folder.run_path(plain).iterdir() if file.is_file())
     found = forecast(folder, [], 2, lambda done: None)
     assert [run.status for run in found.runs] == ["finished", "waiting"]
     assert (found.seconds, found.core_seconds) == (104.0, 104.0)
-    assert (found.disk_bytes, found.disk_peak_bytes) == (size + 50, size + 70)
     # a study that takes it over sees the same
     other = StudyFolder(tmp_path / "t", small_study())
     reused = forecast(other, [folder], 2, lambda done: None)
-    assert (reused.seconds, reused.disk_bytes) == (104.0, size + 50)
+    assert reused.seconds == 104.0
     assert probed == ["esp", "esp"]
 
 
 def test_the_forecast_of_a_search_by_hand(tmp_path: Path, probed: list[str]) -> None:
-    """Each prior: 6 trials of 100 s and 50 bytes, and two runs of 104 s and 50 bytes; one of them has 20 more."""
+    """Each prior: 6 trials of 100 s, and two runs of 104 s."""
     found = forecast_search(tuning(budget=6), tmp_path, (0, 1, 2, 3), 2, 2, lambda done: None)
     assert [run.seconds for run in found.runs] == [6 * 100.0 + 2 * 104.0] * 2
     assert (found.core_seconds, found.seconds) == (2 * 808.0, 808.0)
-    assert (found.disk_bytes, found.disk_peak_bytes) == (2 * 8 * 50, 2 * 8 * 50 + 2 * 20)
 
 
 def test_twice_the_steps_cost_about_twice_the_iterations_and_evaluations(monkeypatch):
@@ -118,22 +111,7 @@ def test_other_work_on_the_machine_costs_a_run_nothing(monkeypatch):
     assert module._clock(tiny_config().model_copy(update={"device": "cuda"})) is module.time.monotonic
 
 
-def test_the_replay_is_counted_as_full_as_it_will_be():
-    config = resolve_config("navigation", "maddpg", steps=25 * 30, overrides=SMALL)
-    learner = build_learner(config)
-    whole = learner.replay.num_bytes
-    assert learner.bytes_to_come(config.steps) == whole * 30 // 40
-    longer = config.model_copy(update={"steps": 25 * 300})
-    assert learner.bytes_to_come(longer.steps) == whole, "it keeps the last 40"
-    learner.iterate(0.0)
-    assert learner.bytes_to_come(longer.steps) == whole * 38 // 40
-    found = module.measure(config, 4)
-    assert found.peak_bytes - found.disk_bytes > 3 * (whole * 30 // 40)
-
-
-def test_an_on_policy_run_has_no_replay_and_threads_are_as_before():
+def test_threads_are_as_before():
     before = torch.get_num_threads()
-    config = tiny_config(steps=100)
-    assert build_learner(config).bytes_to_come(config.steps) == 0
-    assert module.measure(config, 4).disk_bytes > 0
+    assert module.measure(tiny_config(steps=100), 4).training_s > 0
     assert torch.get_num_threads() == before
