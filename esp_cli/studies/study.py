@@ -5,7 +5,6 @@ Layout::
     study.json          what is to be run, and the command that said so
     runs/NAME/          one run folder per cell, see esp_cli.training.run_folder
     runs/NAME/final-evaluation.json   the trained policies beside the reference policies, on episodes of their own
-                        (judgement.json in folders of versions before 0.2)
     runs/NAME/log.txt   what the processes that trained and evaluated it said
     study.lock          held by the process that works on the study
 """
@@ -40,7 +39,6 @@ from esp_cli.training.folder_names import FINAL, LOG, STUDY
 from esp_envs.errors import UserError
 from esp_envs.registry import make
 
-_OLD_FINAL = "judgement.json"
 STUDY_FORMAT = DocumentFormat("esp-study", 1, "a study", StudyError)
 
 
@@ -222,10 +220,9 @@ class StudyFolder(RunSet):
 
 def read_evaluation(run: Path) -> FinalEvaluation | None:
     """Read the final evaluation of the trained policy in a run folder; None where there is none, or half of one."""
-    for name in (FINAL, _OLD_FINAL):
-        with contextlib.suppress(OSError, DocumentError, ValidationError):
-            text = read_regular(run / name, MAX_DOCUMENT_BYTES) or b""
-            return validate(FinalEvaluation, parse_object(text, "text"))
+    with contextlib.suppress(OSError, DocumentError, ValidationError):
+        text = read_regular(run / FINAL, MAX_DOCUMENT_BYTES) or b""
+        return validate(FinalEvaluation, parse_object(text, "text"))
     return None
 
 

@@ -144,17 +144,6 @@ def test_finished_is_trained_and_evaluated(tmp_path):
     assert read_evaluation(folder.run_path(esp)) is None
 
 
-def test_a_folder_of_an_older_version_has_its_final_evaluation_under_another_name(tmp_path):
-    folder = write_study(tmp_path / "s", small_study(), ENDS)
-    plain = folder.study.cells[0]
-    found, old = read_evaluation(folder.run_path(plain)), folder.run_path(plain) / "judgement.json"
-    folder.evaluation_path(plain).rename(old)
-    assert folder.is_finished(plain)
-    assert read_evaluation(folder.run_path(plain)) == found
-    old.write_text("{}")
-    assert not folder.is_finished(plain)
-
-
 def test_a_run_of_another_configuration_is_not_gone_on_with(tmp_path):
     folder = write_study(tmp_path / "s", small_study(), ENDS)
     file = folder.run_path(folder.study.cells[0]) / "config.json"
