@@ -35,7 +35,8 @@ from esp_envs.base import Environment
 from esp_envs.errors import UserError
 from esp_envs.spec import TaskSpec
 
-PROBE_STEPS = 100  # environment steps per seed on which the symmetry errors are measured after every update
+# environment steps per seed on which the symmetry errors are measured after every update: fewer of many agents
+PROBE_STEPS, PROBE_ROWS = 100, 1600
 # metrics that have to be finite for a seed to go on
 WATCHED = ("policy_loss", "value_loss", "actor_grad_norm", "critic_grad_norm")
 
@@ -160,7 +161,8 @@ class Mappo(Learner):
                 self._gradient_step(minibatch, entropy_coef, sums if is_last else None)
         metrics |= {f"train/{name}": value / config.num_minibatches for name, value in sums.items()}
         metrics["train/augmented_share"] = self.prior.augmented_share(batch.obs.shape[0])
-        probed = batch.first(max(1, PROBE_STEPS // batch.obs.shape[2]))
+        num_steps, num_agents = batch.obs.shape[2:4]
+        probed = batch.first(max(1, min(PROBE_STEPS, PROBE_ROWS // num_agents) // num_steps))
         errors = self.prior.errors(probed, self.answers)
         return metrics | {f"train/{name}": error for name, error in errors.items()}
 

@@ -9,6 +9,7 @@ import torch
 
 from esp_cli.algorithms.rollout import Batch, Rollout, values_along
 from esp_cli.networks.contract import WithVJP
+from esp_cli.prior.symmetry_prior import SymmetryPrior
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
 from esp_envs.base import Observation
@@ -303,6 +304,16 @@ def test_minibatches_take_every_row_once_in_an_order_of_each_seed_and_epoch():
         orders += torch.cat([part.value for part in parts], 1).flatten(1).unbind(0)
     assert all(torch.equal(order.sort().values, numbers) for order in orders)
     assert len({tuple(order.tolist()) for order in [numbers, *orders]}) == 5
+
+
+@pytest.mark.parametrize(("agents", "steps"), [(3, 100), (16, 100), (100, 16)])
+def test_symmetry_errors_are_measured_on_as_many_agents_of_large_teams(agents, steps, monkeypatch: pytest.MonkeyPatch):
+    seen = []
+    monkeypatch.setattr(SymmetryPrior, "errors", lambda self, batch, evaluate: seen.append(batch.obs.shape) or {})
+    many = {"task__num_agents": agents, "task__sees": 2, "task__density": 8} if agents > 3 else {}
+    trained = learner(mappo__num_envs=5, mappo__num_epochs=1, network__name="set", mappo__critic_input="own", **many)
+    trained.iterate(0.0)
+    assert seen[0][1:4] == (steps, 1, agents)
 
 
 RECOMPUTED = {
