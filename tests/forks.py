@@ -74,6 +74,16 @@ def wait(pid: int) -> int:
     return -999
 
 
+def killed(job: Callable[[], None], path: Path, rows: Callable[[], int], least: int) -> None:
+    """Run a job in a fork and kill it as soon as it has written this many rows."""
+    process, deadline = fork(job, path), time.monotonic() + 300
+    while rows() < least and time.monotonic() < deadline:
+        time.sleep(0.005)
+    os.kill(process, signal.SIGKILL)
+    assert wait(process) == -signal.SIGKILL, said(path)
+    assert rows() >= least
+
+
 def said(path: Path) -> str:
     """Return what the last process beside a path said."""
     file = path.with_name("said.txt")

@@ -66,7 +66,7 @@ def _forecast(benchmark: Benchmark, choices: StudyChoices) -> None:
         for name, method in benchmark.taken
     }
     with studying.measuring(len(pairs)) as listener:
-        title, counts = benchmark.trials().title, (benchmark.budget, 1)
+        title, counts = benchmark.title, (benchmark.budget, 1)
         found = forecast_tuned(title, out, pairs, counts, request.episodes, jobs, listener)
     studying.print_forecast(found, choices.json, f"{benchmark.budget} trials of each, and the run that judges it")
 
@@ -78,7 +78,7 @@ def _judge(benchmark: Benchmark, choices: StudyChoices) -> None:
     from esp_cli.training.folder_names import FRESH
 
     out: Path = choices.folder("symmetry")
-    planned, fresh = benchmark.trials(), None
+    planned, fresh = benchmark.trials, None
     with (
         studying.open_resources(choices, out, benchmark.request.device) as resources,
         Trials.held(out),
@@ -93,8 +93,4 @@ def _judge(benchmark: Benchmark, choices: StudyChoices) -> None:
             study = benchmark.judged(trials)
             fresh = StudyFolder.create(out / FRESH, study)
             failed = studying.run_cells(fresh, study, resources, requests)
-    if requests:
-        raise studying.stopped(choices.command)
-    if fresh is not None:
-        studying.report_study(fresh, choices.json)
-    studying.refuse_failed(failed, out)
+    studying.conclude(fresh, failed, requests, out, choices)

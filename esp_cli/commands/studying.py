@@ -89,10 +89,25 @@ def run_study(
         begun = time.monotonic()
         folder = StudyFolder.create(out, study)
         failed = run_cells(folder, study, resources, requests)
+    if not requests:
+        console.note(f"this took {console.format_duration(time.monotonic() - begun)}")
+    conclude(folder, failed, requests, out, choices, mode, thresholds)
+
+
+def conclude(
+    study: StudyFolder | None,
+    failed: Sequence[str],
+    requests: Sequence[int],
+    out: Path,
+    choices: StudyChoices,
+    mode: Mode | None = None,
+    thresholds: Sequence[float] = (),
+) -> None:
+    """End a command that ran a study in `out`: as stopped, or with the study's report and a word on what failed."""
     if requests:
         raise stopped(choices.command)
-    console.note(f"this took {console.format_duration(time.monotonic() - begun)}")
-    report_study(folder, choices.json, mode, thresholds)
+    if study is not None:
+        report_study(study, choices.json, mode, thresholds)
     refuse_failed(failed, out)
 
 

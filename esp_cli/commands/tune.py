@@ -138,11 +138,7 @@ def _tune(tuning: Tuning, request: Request, choices: StudyChoices) -> None:
             study = fresh_study(tuning, best, request.seeds, request.episodes)
             fresh = StudyFolder.create(judged, study)
             failed = studying.run_cells(fresh, study, resources, requests)
-    if requests:
-        raise studying.stopped(choices.command)
-    if fresh is not None:
-        studying.report_study(fresh, choices.json)
-    studying.refuse_failed(failed, out)
+    studying.conclude(fresh, failed, requests, out, choices)
     if not best:
         raise UserError("no trial has a score, so there is nothing to judge")
 

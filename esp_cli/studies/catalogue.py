@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from esp_cli.algorithms.presets import ALGORITHMS, SETS
@@ -73,12 +73,17 @@ def _cells(kind: StudyKind, request: Request) -> tuple[Cell, ...]:
         fault = "name each variant of this study once" if unknown is None else f"this study has no variant '{unknown}'"
         raise UserError(f"{fault}; they are {', '.join(map(repr, kind.variants))}")
     tasks, algorithms = tuple(request.tasks or kind.tasks), tuple(request.algorithms or kind.algorithms)
-    for setting in request.overrides:
-        if any(task_setting(setting, task) in kind.varies for task in tasks):
-            raise UserError(f"--set {setting} is what this study varies by itself; leave it out")
+    refuse_varied(request.overrides, tasks, kind.varies)
     _refuse_unused(kind, request, tasks, algorithms)
     build = _pairs if kind.rows == "panels" else _variants
     return tuple(cell for task in tasks for cell in build(kind, task, algorithms, variants, request))
+
+
+def refuse_varied(settings: Iterable[str], tasks: Sequence[str], varied: Container[str]) -> None:
+    """Refuse a user's setting that a study chooses itself in runs of one of the tasks."""
+    for setting in settings:
+        if any(task_setting(setting, task) in varied for task in tasks):
+            raise UserError(f"--set {setting} is what this study varies by itself; leave it out")
 
 
 def _pairs(

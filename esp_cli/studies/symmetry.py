@@ -7,6 +7,7 @@ import math
 import random
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from esp_cli.checking.measured import planned
 from esp_cli.files.formatting import file_name, format_exactly
 from esp_cli.files.writing import replace_file
 from esp_cli.prior.config import of_no_use_to
-from esp_cli.studies.catalogue import Request, concerns, task_setting
+from esp_cli.studies.catalogue import Request, concerns, refuse_varied, task_setting
 from esp_cli.studies.kinds import KINDS, Settings
 from esp_cli.studies.run_set import Cell, StudyError
 from esp_cli.studies.study import Study, StudyFolder
@@ -151,6 +152,8 @@ class Benchmark:
         left_out: by "TASK: METHOD" why the task does not take the method.
     """
 
+    title = "Trials of the benchmark of symmetry"
+
     def __init__(self, request: Request, budget: int) -> None:
         self.request, self.budget = request, budget
         self.methods = tuple(METHODS if request.variants is None else request.variants)
@@ -177,8 +180,7 @@ class Benchmark:
         own = {name for method in self.methods for name in METHODS[method]}
         for board in self.boards.values():
             varied = own | {name for name in board.settings if name.startswith("task.")}
-            if wrong := next((n for n in self.request.overrides if task_setting(n, board.task) in varied), None):
-                raise UserError(f"--set {wrong} is what this study varies by itself; leave it out")
+            refuse_varied(self.request.overrides, [board.task], varied)
         for task, _ in self.request.steps or ():
             if task is not None and task not in self.boards:
                 raise UserError(f"--steps {task} concerns no run of this study; its tasks are {', '.join(self.boards)}")
@@ -241,10 +243,11 @@ class Benchmark:
         same = {"command": self.request.command, "episodes": self.request.episodes, "left_out": self.left_out}
         return Study(kind=kind, title=title, rows="variants", cells=cells, **same)
 
+    @cached_property
     def trials(self) -> Study:
-        """Plan the trials of all methods on all tasks."""
+        """The plan of the trials of all methods on all tasks."""
         cells = [self._cell(*pair, draw, trial=True) for pair in self.taken for draw in range(self.budget)]
-        return self._study("symmetry-trials", "Trials of the benchmark of symmetry", tuple(cells))
+        return self._study("symmetry-trials", self.title, tuple(cells))
 
     def judged(self, trials: Trials) -> Study:
         """Plan the runs that judge, with the settings of each method's best trial, the first of equal ones.
@@ -252,7 +255,7 @@ class Benchmark:
         `trials.json` in the folder holds the draws and the scores.
         """
         cells, scores, size = [], dict[str, list[float | None]](), self.budget
-        of_trials = [score(trials.run_path(cell)) for cell in self.trials().cells]
+        of_trials = [score(trials.run_path(cell)) for cell in self.trials.cells]
         for k, (name, method) in enumerate(self.taken):
             own = of_trials[k * size : (k + 1) * size]
             scores[f"{name}: {method}"] = [value if math.isfinite(value) else None for value in own]

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
-import time
 from pathlib import Path
 
 import pytest
@@ -14,7 +11,7 @@ from esp_cli import app
 from esp_cli.studies.study import StudyFolder
 from esp_cli.training import trainer
 from tests.cli.running import TINY_OPTIONS, esp, refused
-from tests.forks import fork, said, wait
+from tests.forks import fork, killed, said, wait
 
 SMALL = ("reproduce", "symmetry", "--tasks", "navigation", "--budget", "2", "--seeds", "2", "--episodes", "4")
 STEPS = ("--steps", "500")
@@ -61,12 +58,7 @@ def test_a_benchmark_that_is_killed_goes_on_and_ends_in_a_report(tmp_path: Path)
 
     names = ["runs/navigation-1.5k-plain-1", "fresh/runs/navigation-1.5k-esp"]
     for name in names:
-        process, deadline = fork(study, out), time.monotonic() + 300
-        while rows(name) < 3 and time.monotonic() < deadline:
-            time.sleep(0.005)
-        os.kill(process, signal.SIGKILL)
-        assert wait(process) == -signal.SIGKILL, said(out)
-        assert rows(name) >= 3
+        killed(study, out, lambda name=name: rows(name), 3)
     assert wait(fork(study, out)) == 0, said(out)
     told = esp(*words, "--out", alone)
     for name in names:

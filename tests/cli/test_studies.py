@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import shlex
-import signal
 import sys
-import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +26,7 @@ from esp_cli.training.metrics import read_metrics
 from esp_envs.errors import UserError
 from esp_envs.installed import install
 from tests.cli.running import TINY_OPTIONS, esp, refused, train_tiny
-from tests.forks import fork, said, wait
+from tests.forks import fork, killed, said, wait
 from tests.studies.small_studies import small_study, stand_in
 
 TINY = ("reproduce", "table1", "--tasks", "navigation", "--algos", "mappo", "--seeds", "2", "--episodes", "4")
@@ -275,12 +272,7 @@ def test_a_study_that_is_killed_twice_loses_nothing_and_runs_nothing_twice(tmp_p
 
     names = ["navigation-1.5k-mappo-plain", "navigation-1.5k-mappo-esp"]
     for name in names:  # each time in the middle of another run
-        process, deadline = fork(study, out), time.monotonic() + 300
-        while rows(name) < 5 and time.monotonic() < deadline:
-            time.sleep(0.005)
-        os.kill(process, signal.SIGKILL)
-        assert wait(process) == -signal.SIGKILL, said(out)
-        assert rows(name) >= 5
+        killed(study, out, lambda name=name: rows(name), 5)
     first = (out / "runs" / names[0] / "policy.safetensors").stat().st_mtime_ns
     assert wait(fork(study, out)) == 0, said(out)
     assert (out / "runs" / names[0] / "policy.safetensors").stat().st_mtime_ns == first, "not run again"

@@ -32,7 +32,7 @@ def benchmark(budget: int = 3, **choice: Any) -> Benchmark:
 
 def write_trials(path: Path, asked: Benchmark, ends: dict[str, float]) -> Trials:
     """Write trials whose last evaluation is the one by name, 0 for those without."""
-    folder = Trials.create(path, asked.trials())
+    folder = Trials.create(path, asked.trials)
     for cell in folder.study.cells:
         run, end = folder.prepare(cell), ends.get(cell.name, 0.0)
         rows = ({"step": k, "eval/return_greedy": [value] * 3} for k, value in enumerate((9.0, end, end)))
@@ -119,11 +119,11 @@ def test_the_best_trial_is_judged_and_the_first_of_equal_ones(tmp_path: Path) ->
 def test_what_is_judged_gets_no_further_trials_but_other_methods_do(tmp_path: Path) -> None:
     asked = benchmark()
     judged = asked.judged(write_trials(tmp_path / "s", asked, {}))
-    Trials.create(tmp_path / "s", benchmark(budget=4, variants=("plain",)).trials())
+    Trials.create(tmp_path / "s", benchmark(budget=4, variants=("plain",)).trials)
     StudyFolder.create(tmp_path / "s" / "fresh", judged)
     with pytest.raises(StudyError, match="has judged navigation-200k-esp already; keep its --budget"):
-        Trials.create(tmp_path / "s", benchmark(budget=4).trials())
-    assert len(Trials.create(tmp_path / "s", benchmark(variants=("copies",)).trials()).study.cells) == 6 + 1 + 3
+        Trials.create(tmp_path / "s", benchmark(budget=4).trials)
+    assert len(Trials.create(tmp_path / "s", benchmark(variants=("copies",)).trials).study.cells) == 6 + 1 + 3
 
 
 @pytest.mark.parametrize(
