@@ -158,8 +158,9 @@ def over_setting(
 
 
 def appearance(index: int) -> tuple[str, LineStyle]:
-    """Return the colour and the line style of the curve with this index."""
-    return COLORS[index % len(COLORS)], _LINE_STYLES[index % len(_LINE_STYLES)]
+    """Return the colour and the line style of the curve with this index; 32 of them differ."""
+    around = index // len(COLORS)
+    return COLORS[index % len(COLORS)], _LINE_STYLES[(index + around) % len(_LINE_STYLES)]
 
 
 @contextmanager
