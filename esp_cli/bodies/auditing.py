@@ -19,34 +19,24 @@ from esp_envs.errors import UserError
 from esp_envs.installed import last_line
 
 _OBS, _ACTIONS = ("obs", "observations", "observation", "states", "state"), ("actions", "action")
-_RANDOM = 8
-"""Random rows, which tell whether the function is linear."""
+_RANDOM = 8  # random rows, which tell whether the function is linear
 _TOLERANCE = 1e-5
 
 
 @dataclass(frozen=True)
 class Copy:
-    """What one copy of a mirror function turned out to be.
+    """What one copy of a mirror function turned out to be."""
 
-    Attributes:
-        element: the element that it comes nearest to; "identity" of the first.
-        is_involution: whether it undoes itself, as a mirror does.
-        wrong: of each wrong number its name, what it takes, and what is right: ("action.hip", "hip", "-hip").
-    """
-
-    element: str
-    is_involution: bool
-    wrong: tuple[tuple[str, str, str], ...]
+    element: str  # the element that it comes nearest to; "identity" of the first
+    is_involution: bool  # whether it undoes itself, as a mirror does
+    wrong: tuple[tuple[str, str, str], ...]  # number, what it takes, what is right: ("action.hip", "hip", "-hip")
 
 
 def audit(function: Callable[..., Any], body: Body, numbers: Numbers) -> list[Copy]:
     """Compare each copy that a function makes with the body's elements.
 
     The function is called as rsl_rl calls it, with what it takes of `env`, `obs` and `actions`. It is given unit
-    vectors, so that each number of its results tells where it comes from.
-
-    Raises:
-        UserError: it fails, returns something else, or is not linear.
+    vectors, so that each number of its results tells where it comes from; so it has to be linear.
     """
     count = max(layout.width for layout in numbers.values()) + _RANDOM
     noise = torch.Generator().manual_seed(0)
@@ -98,11 +88,7 @@ def _words(row: Floats, labels: list[str]) -> str:
 
 
 def _called(function: Callable[..., Any], numbers: Numbers, rows: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Call a function as its parameters ask for, and return observations by group and actions.
-
-    Raises:
-        UserError: it fails, or takes a TensorDict, which is not installed.
-    """
+    """Call a function as its parameters ask for, and return observations by group and actions."""
     groups = [name for name in numbers if name != ACTION]
     takes = list(inspect.signature(function).parameters)
     seen: Any = rows[groups[0]].clone() if groups else None

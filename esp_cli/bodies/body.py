@@ -20,8 +20,7 @@ from esp_cli.symmetry.plane import PlaneElement
 from esp_envs.errors import UserError
 from esp_envs.spec import Field, Kind, Layout
 
-SECONDS = 50.0
-"""Processor time within which the search of a model ends."""
+SECONDS = 50.0  # processor time within which the search of a model ends
 
 
 class Body:

@@ -24,34 +24,22 @@ from esp_envs.errors import UserError
 
 LOOSE = 0.1
 """How far a joint's line may be off, as a share of the robot's size, or of the length of its axis, to be matched."""
-FAR = 0.25
-"""How far a body's middle of mass may be off, as a share of the robot's size, to be matched."""
+FAR = 0.25  # how far a body's middle of mass may be off, as a share of the robot's size, to be matched
 _APART = 1e6
 
 
 @dataclass(frozen=True)
 class Match:
-    """What one element does to a model's state: qpos' = qpos qpos + offset, qvel' = qvel qvel, ctrl' = ctrl ctrl.
-
-    Attributes:
-        element: of the plane.
-        bodies: [bodies, bodies] where each goes; a column of 0 where it has no image.
-        joint: [joints] the image of each joint.
-        qpos: [nq, nq].
-        offset: [nq]; 0 but for joints whose reference is not 0, and a base away from the origin.
-        qvel: [nv, nv].
-        ctrl: [nu, nu].
-        unmatched: names of actuators that have no image; their rows and columns are 0.
-    """
+    """What one element does to a model's state: qpos' = qpos qpos + offset, qvel' = qvel qvel, ctrl' = ctrl ctrl."""
 
     element: PlaneElement
-    bodies: Floats
-    joint: Indices
-    qpos: Floats
-    offset: Floats
-    qvel: Floats
-    ctrl: Floats
-    unmatched: tuple[str, ...]
+    bodies: Floats  # [bodies, bodies] where each goes; a column of 0 where it has no image
+    joint: Indices  # [joints] the image of each joint
+    qpos: Floats  # [nq, nq]
+    offset: Floats  # [nq]; 0 but for joints whose reference is not 0, and a base away from the origin
+    qvel: Floats  # [nv, nv]
+    ctrl: Floats  # [nu, nu]
+    unmatched: tuple[str, ...]  # names of actuators that have no image; their rows and columns are 0
 
     @property
     def is_trivial(self) -> bool:
@@ -60,12 +48,7 @@ class Match:
 
 
 def derive(frame: Frame, element: PlaneElement) -> Match:
-    """Find what an element does to a model.
-
-    Raises:
-        UserError: the model at rest is far from being its own image; it names a joint or body without an image. Or the
-            time is over.
-    """
+    """Find what an element does to a model; an error names the joint or body that is without an image at rest."""
     R = frame.image(element)
     com = frame.com[frame.moving]
     gaps = np.linalg.norm((com @ R.T)[:, None] - com, axis=-1).min(1)
@@ -174,10 +157,7 @@ def _times(q: Floats) -> Floats:
 
 
 def _control_map(frame: Frame, qvel: Floats) -> tuple[Floats, tuple[str, ...]]:
-    """Return the map of controls, and the names of actuators that have no image.
-
-    An actuator pulls with a moment [nv] on the degrees of freedom; its image pulls with the image of it.
-    """
+    """Return the map of controls, and the actuators without an image: none pulls with the image of its moment [nv]."""
     model = frame.model
     data = mujoco.MjData(model)
     mujoco.mj_fwdPosition(model, data)

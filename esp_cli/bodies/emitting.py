@@ -27,29 +27,15 @@ HOSTS |= {"skrl": "augment", "sb3": "augment", "numpy": "mirrored"}
 
 
 def emitted(body: Body, numbers: Numbers, model: str) -> str:
-    """Return the source of a file with the mirrors of observations and actions, as `written` computes them.
-
-    Args:
-        body: of the robot.
-        numbers: what its observations and actions are.
-        model: the name of the model, for the file.
-
-    Raises:
-        UserError: the body has no symmetry.
-    """
+    """Return the source of a file with the mirrors of a model's observations and actions, as `written` has them."""
     return _filled(written, _data(body, numbers, model, body.elements))
 
 
 def mirror_of(body: Body, numbers: Numbers, group: str | None = None) -> ModuleType:
     """Return what an `emitted` file would be once imported, without one: ELEMENTS, `mirrored`, `augment` and others.
 
-    Args:
-        body: of the robot.
-        numbers: what its observations and actions are.
-        group: the elements that leave your reward alone, such as "left-right"; by default all that the body has.
-
-    Raises:
-        UserError: the body has no symmetry, or lacks an element of the group.
+    Its `group` are the elements that leave your reward alone, such as "left-right"; by default all that the body has. A
+    body without a symmetry, or without an element of the group, is a UserError.
     """
     wanted = body.elements
     if group is not None:

@@ -31,17 +31,11 @@ TRIED = tuple(
 
 @dataclass(frozen=True)
 class Difference:
-    """The property of a joint that differs most from that of its image.
+    """The property of a joint that differs most from that of its image."""
 
-    Attributes:
-        what: "mass", "range", "gain", ...; empty where nothing differs.
-        share: the difference over the larger of the two; of places, over the robot's size.
-        shares: those of all properties: masses, inertia, limits, gains, geometry of what collides, damping, ...
-    """
-
-    what: str
-    share: float
-    shares: Mapping[str, float]
+    what: str  # "mass", "range", "gain", ...; empty where nothing differs
+    share: float  # the difference over the larger of the two; of places, over the robot's size
+    shares: Mapping[str, float]  # those of all properties: masses, inertia, limits, gains, damping and others
 
 
 @dataclass(frozen=True)

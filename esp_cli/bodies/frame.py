@@ -15,26 +15,17 @@ from esp_cli.symmetry.elements import Floats
 from esp_cli.symmetry.plane import PlaneElement
 from esp_envs.errors import UserError
 
-FREE, BALL, SLIDE, HINGE = range(4)
-"""MuJoCo's types of joints."""
-QPOS_WIDTH, DOF_WIDTH = (7, 4, 1, 1), (6, 3, 1, 1)
-"""Numbers of a joint's position and velocity, by type."""
+FREE, BALL, SLIDE, HINGE = range(4)  # MuJoCo's types of joints
+QPOS_WIDTH, DOF_WIDTH = (7, 4, 1, 1), (6, 3, 1, 1)  # numbers of a joint's position and velocity, by type
 
 
 class Frame:
-    """A model at rest: where its joints and masses are, all seen from the middle of its base.
+    """A model at rest: where its joints and masses are, all seen from the middle of its base, its first free joint.
 
-    Args:
-        model: the `mujoco.MjModel`.
-        seconds: of processor time that looking for its symmetries may take.
-
-    Attributes:
-        base: its first free joint, or None.
-        centre: [3], what mirrors and turns leave where it is; z is 0.
-        axes: [3, 3] the base's own, in columns: elements are told by them.
-        size: largest distance of a joint or mass from their middle, m.
-        places: [bodies, 2, 3] origin and middle of mass of each body, without what is fixed to it.
-        inertia: [bodies, 3, 3] of each body, along the world's axes.
+    Mirrors and turns leave `centre` [3] where it is; its z is 0. `axes` [3, 3] are the base's own, in columns: elements
+    are told by them. `size` is the largest distance of a joint or mass from their middle, m. `places` [bodies, 2, 3]
+    are origin and middle of mass of each body, without what is fixed to it, and `inertia` [bodies, 3, 3] is along the
+    world's axes. Looking for symmetries may take `seconds` of processor time.
     """
 
     def __init__(self, model: Any, seconds: float = math.inf) -> None:
@@ -92,10 +83,7 @@ class Frame:
 
     @cached_property
     def shapes(self) -> dict[int, list[tuple[int, Floats, Floats]]]:
-        """By moving body, the type, middle [3] and squared extent [3, 3] of each shape of it that collides.
-
-        A mesh has no extent, since its axes are those of its inertia and may be any.
-        """
+        """By moving body: type, middle [3], squared extent [3, 3] of each shape that collides; a mesh has no extent."""
         model, found = self.model, dict[int, list[tuple[int, Floats, Floats]]]()
         for g in np.flatnonzero(model.geom_contype | model.geom_conaffinity):
             kind, axes = int(model.geom_type[g]), self._geoms[1][g]

@@ -72,20 +72,14 @@ KIND_MATRICES |= {
 class PartsKind(Kind):
     """Numbers of parts that an element sends to each other: joints, actuators, limbs, points around a body.
 
-    Attributes:
-        parts: what each number is called.
-        moves: elements, each with its orthogonal matrix [width, width].
+    Each element has an orthogonal matrix [width, width] in `moves`.
     """
 
-    parts: tuple[str, ...] = ()
+    parts: tuple[str, ...] = ()  # what each number is called
     moves: tuple[tuple[PlaneElement, tuple[tuple[float, ...], ...]], ...] = ()
 
     def matrix(self, planar: Floats) -> Floats:
-        """Return how the numbers of one item transform under a matrix of the plane.
-
-        Raises:
-            UserError: the body has no such symmetry.
-        """
+        """Return how the numbers of one item transform under a matrix of the plane that is a symmetry of the body."""
         for element, rows in self.moves:
             if np.allclose(element.matrix, planar, atol=1e-9):
                 return np.array(rows)
@@ -135,15 +129,9 @@ def points_field(
 
 
 def grid(size: tuple[float, float], resolution: float, ordering: str = "xy") -> Floats:
-    """Return the points [n, 2] of a grid around the body, in the order of Isaac Lab's grid pattern.
+    """Return the points [n, 2] of a grid of a size, m, around the body, in the order of Isaac Lab's grid pattern.
 
-    Args:
-        size: extent along x and y, m.
-        resolution: between points, m.
-        ordering: "xy" lets x run fastest, "yx" y.
-
-    Raises:
-        UserError: another ordering, or no point.
+    Points are `resolution` m apart; "xy" lets x run fastest, "yx" y. Another ordering, or no point, is a UserError.
     """
     if ordering not in ("xy", "yx") or resolution <= 0 or min(size) < 0:
         raise UserError(f"grid({size}, {resolution}, {ordering!r}) is none; give sizes, a resolution and 'xy' or 'yx'")
@@ -154,24 +142,14 @@ def grid(size: tuple[float, float], resolution: float, ordering: str = "xy") -> 
 
 @dataclass(frozen=True)
 class Parts:
-    """Some parts of a body, where the numbers of each are, and matrices over all of them.
+    """Some parts of a body, where the numbers of each are, and matrices over all of them."""
 
-    Attributes:
-        what: what messages call them: "joints".
-        places: the numbers of each part, by its name.
-        moves: what each element does to the numbers.
-    """
-
-    what: str
-    places: Mapping[str, slice]
-    moves: Mapping[PlaneElement, Floats]
+    what: str  # what messages call them: "joints"
+    places: Mapping[str, slice]  # the numbers of each part, by its name
+    moves: Mapping[PlaneElement, Floats]  # what each element does to the numbers
 
     def field(self, name: str, names: Sequence[str], history: int, width: int = 1) -> Field:
-        """Return a field of some parts, in this order, each with `width` numbers of its own.
-
-        Raises:
-            UserError: a part is unknown or named twice, or its image is not among them.
-        """
+        """Return a field of some parts, in this order, each with `width` numbers; their images must be among them."""
         if unknown := next((n for n in names if n not in self.places), None):
             known = ", ".join(map(printable, list(self.places)[:8])) + (", ..." if len(self.places) > 8 else "")
             raise UserError(f"field '{name}': there is no {printable(unknown)} among the {self.what} {known}")
@@ -195,14 +173,8 @@ class Parts:
 def named_parts(what: str, names: Sequence[str], tables: Mapping[str, Any]) -> Parts:
     """Return parts of one number each, with what tables of names say, and their products.
 
-    Args:
-        what: what messages call them.
-        names: of all of them, in any order.
-        tables: by part its image, with "-" where the sign changes; or such tables by element. What is left out of a
-            table follows from its partner.
-
-    Raises:
-        UserError: a table names none of them, sends two to one, or does not multiply as the elements do.
+    A table holds by part its image, with "-" where the sign changes; or there are such tables by element. What is left
+    out of a table follows from its partner.
     """
     if tables and all(isinstance(value, str) for value in tables.values()):
         tables = {"left-right": tables}

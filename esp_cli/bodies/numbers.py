@@ -23,21 +23,15 @@ from esp_envs.installed import import_function
 from esp_envs.spec import Layout, layout
 
 _MOST_BYTES = 1 << 20
-ACTION = "action"
-"""The name of the actions among groups of observations."""
-Numbers = dict[str, Layout]
-"""Layouts of the groups of an observation, by name, and of the action under "action"."""
+ACTION = "action"  # the name of the actions among groups of observations
+Numbers = dict[str, Layout]  # layouts of the groups of an observation, by name, and of the action under "action"
 
 
 def numbers_of(body: Body, order: str | None) -> Numbers:
     """Return what a function "module:function" says, or the numbers of Isaac Lab's velocity tasks.
 
-    Args:
-        body: of the robot.
-        order: a function, or a file of joint names in the simulator's order, one a line; by default the model's order.
-
-    Raises:
-        UserError: there is no such function or file, a line names no joint, or the function returns something else.
+    `order` is that function, or a file of joint names in the simulator's order, one a line; by default the model's
+    order.
     """
     if order is None or ":" not in order or Path(order).exists():
         names = None if order is None else _lines(Path(order))
@@ -54,11 +48,7 @@ def numbers_of(body: Body, order: str | None) -> Numbers:
 
 
 def _lines(path: Path) -> list[str]:
-    """Return the joint names of a file, one a line.
-
-    Raises:
-        UserError: there is none, or it is no short text.
-    """
+    """Return the joint names of a file, one a line."""
     try:
         content = read_regular(path, _MOST_BYTES)
         names = "" if content is None else content.decode()

@@ -20,8 +20,7 @@ from esp_cli.symmetry.elements import Floats
 
 EXACT, NEARLY = 1e-5, 0.05
 """Largest gap of a mirror that is exact up to rounding, and of one that holds but for a model's small asymmetry."""
-SEEN = 3.0
-"""How many times the gap of a planted mistake exceeds the gap without it, where the proof would have seen it."""
+SEEN = 3.0  # how many times the gap of a planted mistake exceeds the gap without it, where the proof would have seen it
 NO_MIRROR = (mujoco.mjtSensor.mjSENS_USER, mujoco.mjtSensor.mjSENS_PLUGIN)
 """Kinds of sensors of which nobody knows what their readings mean."""
 _STATES, _LYING, _PLANTED = 48, 24, 12
@@ -30,8 +29,7 @@ _NO_CONSTRAINTS, _NO_SENSORS, _NO_CONTACTS = (
     int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in ("CONSTRAINT", "SENSOR", "CONTACT")
 )
 _NO_LIMITS = int(mujoco.mjtDisableBit.mjDSBL_LIMIT | mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS) | _NO_CONTACTS
-Sample = tuple[Floats, Floats, Floats, Floats]
-"""qpos, qvel, ctrl and forces on the degrees of freedom."""
+Sample = tuple[Floats, Floats, Floats, Floats]  # qpos, qvel, ctrl and forces on the degrees of freedom
 
 
 @dataclass(frozen=True)
@@ -101,11 +99,7 @@ class Proof:
 
 
 def prove(frame: Frame, match: Match, seed: int = 0) -> Proof:
-    """Compare accelerations of states and of their images, and of planted mistakes.
-
-    Raises:
-        UserError: the time of the frame is over.
-    """
+    """Compare accelerations of states and of their images, and of planted mistakes."""
     rng, data = np.random.default_rng(seed), mujoco.MjData(frame.model)
     samples = [_state(frame, data, rng) for _ in range(_STATES)]
     images = _images(match, samples)

@@ -15,8 +15,7 @@ import mujoco
 from esp_envs.errors import UserError
 
 mujoco.set_mju_user_warning(lambda _: None)  # by default they go to a file in the working directory
-XML_MIB, ASSET_MIB = 16, 256
-"""Largest size of an XML file, and of a mesh or picture."""
+XML_MIB, ASSET_MIB = 16, 256  # largest size of an XML file, and of a mesh or picture
 MOST_ELEMENTS, MOST_DEPTH, MOST_BODIES, MOST_MOVING = 50_000, 100, 1000, 200
 """Most elements of a model after replication, depth of nesting, bodies, and degrees of freedom or actuators."""
 _LIMITS = dict.fromkeys(("nrow", "ncol", "width", "height", "nuser", "nkey"), 65_536)
@@ -71,11 +70,7 @@ def read_model(path: Path | str, root: Path | str | None = None, floating: bool 
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Keep warnings to itself, and put MuJoCo's errors in a sentence.
-
-    Raises:
-        UserError: it cannot go on, as where contacts take more memory than the model grants.
-    """
+    """Keep warnings to itself, and put MuJoCo's errors in a sentence, as where contacts need too much memory."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -85,11 +80,7 @@ def quiet() -> Iterator[None]:
 
 
 def _inspected(path: Path, allowed: Path) -> str:
-    """Return the tag of a model's first element after checking all that it and its includes ask for.
-
-    Raises:
-        UserError: a file lies outside the folder that may be read, or something asks for too much.
-    """
+    """Return the tag of a model's first element after checking all that it and its includes ask for."""
     trees = list(_trees(path, path, allowed, set()))
     tag = trees[0][1].tag
     if tag not in ("mujoco", "robot"):
@@ -131,11 +122,7 @@ def _trees(path: Path, main: Path, allowed: Path, seen: set[Path]) -> Iterator[t
 
 
 def _files(main: Path, name: str, folders: set[Path], allowed: Path) -> list[Path]:
-    """Return the files that a name may stand for; MuJoCo may also take the last part of it alone.
-
-    Raises:
-        UserError: one lies outside the folder that may be read, or is no regular file.
-    """
+    """Return the files in the readable folder that a name may stand for; MuJoCo may also take its last part alone."""
     name = _short(main, name.removeprefix("package://").replace("\\", "/"))
     names = {name, PurePosixPath(name).name} - {""}
     found = [path for path in (folder / one for folder in folders for one in names) if path.exists()]
@@ -169,11 +156,7 @@ def _check_size(path: Path, most: int) -> None:
 
 
 def _parsed(path: Path) -> ElementTree.Element:
-    """Parse one XML file without a document type, so that no entity is defined.
-
-    Raises:
-        UserError: it is none, or too large.
-    """
+    """Parse one XML file without a document type, so that no entity is defined."""
     _check_size(path, XML_MIB)
     try:
         return ElementTree.fromstring(path.read_bytes(), ElementTree.XMLParser(target=_Builder()))
@@ -187,9 +170,5 @@ class _Builder(ElementTree.TreeBuilder):
     """Builds elements, and refuses a document type before its entities are read."""
 
     def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
-        """Refuse.
-
-        Raises:
-            UserError: always.
-        """
+        """Refuse."""
         raise UserError("it declares a document type, which models do not need; remove <!DOCTYPE ...>")

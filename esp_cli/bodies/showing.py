@@ -17,25 +17,17 @@ from esp_envs.errors import UserError
 from esp_envs.spec import Continuous, Field, Layout
 
 _OF_BODIES = {"cinert": INERTIA, "cvel": TWIST, "cfrc_ext": TWIST}
-_SHOWN = ("qpos", "qvel", "qfrc_actuator", *_OF_BODIES)
-"""Arrays of a simulator of which observations are made."""
+_SHOWN = ("qpos", "qvel", "qfrc_actuator", *_OF_BODIES)  # arrays of a simulator of which observations are made
 
 
 @dataclass(frozen=True)
 class Layouts:
-    """What the numbers of a MuJoCo environment are.
+    """What the numbers of a MuJoCo environment are."""
 
-    Attributes:
-        observation: of each agent.
-        action: of each agent.
-        simulated: of positions and velocities, which decide what follows.
-        orders: the elements under which all agents' numbers transform alike, each with the order of agents.
-    """
-
-    observation: Layout
-    action: Continuous
-    simulated: Layout
-    orders: dict[PlaneElement, Order]
+    observation: Layout  # of each agent
+    action: Continuous  # of each agent
+    simulated: Layout  # of positions and velocities, which decide what follows
+    orders: dict[PlaneElement, Order]  # of agents, by element that transforms all their numbers alike
 
 
 def layouts_of(
@@ -43,16 +35,9 @@ def layouts_of(
 ) -> Layouts:
     """Return the layouts of an environment whose observations are numbers of its simulator.
 
-    Distinct numbers are written into the simulator, and looked for in what the environment shows.
-
-    Args:
-        body: of the simulator's model.
-        data: the environment's `mujoco.MjData`, which is overwritten.
-        observe: returns what each agent sees now, without a step: `lambda: [env.unwrapped._get_obs()]`.
-        acting: for each agent the actuators that it controls, in their order; by default one controls all.
-
-    Raises:
-        UserError: a number is none of the simulator's, or agents see or do unlike things.
+    Distinct numbers are written into `data`, which is overwritten, and looked for in what each agent sees without a
+    step, `observe`: `lambda: [env.unwrapped._get_obs()]`. `acting` are each agent's actuators, in order; by default one
+    has all.
     """
     acts = [np.array(one) for one in acting or [range(data.model.nu)]]
     names, seen = _names(body, data.model), _sources(data, observe)

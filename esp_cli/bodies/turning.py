@@ -31,31 +31,21 @@ Actor = Callable[[Floats], Any]
 class Turning:
     """How far a policy is from turning with one element.
 
-    Attributes:
-        element: its name.
-        distance: between pi(L s) and K pi(s), as a share of that between actions of unrelated states: 0 where the
-            policy turns with the body, about 1 where it knows nothing of the element.
-        action: the number of the action that is farthest off, as a share of its own distance.
-        worst: that share.
+    `distance` is between pi(L s) and K pi(s), as a share of that between actions of unrelated states: 0 where the
+    policy turns with the body, about 1 where it knows nothing of the element.
     """
 
     element: str
     distance: float
-    action: str
-    worst: float
+    action: str  # the number of the action that is farthest off, as a share of its own distance
+    worst: float  # that share
 
 
 def turning(actor: Actor, body: Body, numbers: Numbers, rows: Floats | None = None) -> list[Turning]:
     """Compare what a policy does in states and in their images.
 
-    Args:
-        actor: rows [M, D] of the first group of observations to actions [M, A].
-        body: of the robot.
-        numbers: what its observations and actions are.
-        rows: observations [M, D] that the policy meets; by default normal ones, quaternions and gravity of length 1.
-
-    Raises:
-        UserError: the policy fails or returns something else, or the rows do not fit.
+    The actor takes rows [M, D] of the first group of observations to actions [M, A]. By default rows are normal ones,
+    quaternions and gravity of length 1.
     """
     seen = numbers[next((name for name in numbers if name != ACTION), ACTION)]
     rows = _drawn(seen) if rows is None else rows
@@ -75,11 +65,7 @@ def turning(actor: Actor, body: Body, numbers: Numbers, rows: Floats | None = No
 
 
 def policy_of(name: str) -> Actor:
-    """Return the policy of an ONNX file, of TorchScript, or a function "module:function" of tensors [M, D].
-
-    Raises:
-        UserError: it cannot be read, or has more inputs than observations.
-    """
+    """Return the policy of an ONNX file, of TorchScript, or a function "module:function" of tensors [M, D]."""
     path = Path(name)
     if ":" in name and not path.exists():
         return _of_tensors(import_function(name))
@@ -107,11 +93,7 @@ def policy_of(name: str) -> Actor:
 
 
 def rows_of(path: Path) -> Floats:
-    """Read observations [M, D] of a .npy file.
-
-    Raises:
-        UserError: it is none.
-    """
+    """Read observations [M, D] of a .npy file."""
     try:
         content = BytesIO(read_regular(path, _MOST_BYTES) or b"")
         return np.asarray(np.lib.format.read_array(content, allow_pickle=False), np.float64)

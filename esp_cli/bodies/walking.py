@@ -21,15 +21,11 @@ from esp_envs.settings import TaskSettings
 from esp_envs.spec import Continuous, Field, Kind, TaskSpec, layout
 
 TIMESTEP_S, SUBSTEPS = 0.005, 4
-SWING_RAD = 0.4
-"""How far an action of 1 moves the target of a joint from where it stands."""
-HEIGHT_M = 0.302
-"""Of the trunk, where the robot stands."""
-HIP_AHEAD_M, HIP_ASIDE_M, THIGH_ASIDE_M = 0.2, 0.09, 0.15
-"""Where hips and thighs hang, from the middle of the trunk."""
+SWING_RAD = 0.4  # how far an action of 1 moves the target of a joint from where it stands
+HEIGHT_M = 0.302  # of the trunk, where the robot stands
+HIP_AHEAD_M, HIP_ASIDE_M, THIGH_ASIDE_M = 0.2, 0.09, 0.15  # where hips and thighs hang, from the middle of the trunk
 LEGS = ("left_front", "right_front", "left_hind", "right_hind")
-AHEAD, LEFT = (1, 1, -1, -1), (1, -1, 1, -1)
-"""Where each leg stands."""
+AHEAD, LEFT = (1, 1, -1, -1), (1, -1, 1, -1)  # where each leg stands
 STEPS_OF_A_STRIDE = 16
 CLOCK = Field("clock", Kind.PSEUDOSCALAR, 2)
 """Cosine and sine of the stride's phase. Opposite corners step together, so a mirror shifts it by half a stride, which

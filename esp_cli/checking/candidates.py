@@ -20,12 +20,9 @@ from esp_envs.spec import Discrete, Spaces
 
 _TRIED = ("d8", "d12", "rot57", "flip23")
 """Turns and mirrors that are tried; the last two stand for all angles. Of n moves d-n is tried, too."""
-_EXCHANGES = 28
-"""Up to so many exchanges (those of 8 agents) all pairs are tried; of more things, only neighbours."""
-_MOST_CORNERS = 64
-"""A turn by another part of the whole than one of these stands for all angles, as 57 degrees."""
-_MOST = 64
-"""Of longer lists only generators are tried: where these hold, so do their products."""
+_EXCHANGES = 28  # up to so many exchanges (those of 8 agents) all pairs are tried; of more things, only neighbours
+_MOST_CORNERS = 64  # a turn by another part of the whole than one of these stands for all angles, as 57 degrees
+_MOST = 64  # of longer lists only generators are tried: where these hold, so do their products
 
 
 class NothingToTry(UserError):  # noqa: N818
@@ -35,16 +32,9 @@ class NothingToTry(UserError):  # noqa: N818
 def candidates(spaces: Spaces, transforms: str | None = None) -> list[Element]:
     """Return the elements to try: those asked for, else of polygons, any angle, exchanges of two agents or like items.
 
-    Elements that the actions or layouts cannot carry are left out, and those that move no number of the task. Of the
-    default ones that move all numbers alike, as two mirrors that no vector sees, the first stands for all.
-
-    Args:
-        spaces: of the task.
-        transforms: text as `--transforms` takes it.
-
-    Raises:
-        UserError: the text means nothing.
-        NothingToTry: nothing that is asked for can be tried.
+    Elements that the actions or layouts cannot carry are left out, and those that move no number of the task; where
+    none is left, that is `NothingToTry`. Of the default ones that move all numbers alike, as two mirrors that no vector
+    sees, the first stands for all.
     """
     texts = [transforms] if transforms is not None else _defaults(spaces)
     refusals = _refusals(texts, spaces)
@@ -117,10 +107,7 @@ def is_declared(element: Element | Shift, spaces: Spaces) -> bool:
 
 
 def _elements(text: str, num_agents: int) -> tuple[Element, ...]:
-    """Return those to try: all, or of many each one that is no product of those before it that act on the same.
-
-    Of a group that is sampled these are its generators.
-    """
+    """Return a sampled group's generators, else all; of many those that are no product of earlier ones on the same."""
     found = () if text in ("", "c1") else parse_elements(text, num_agents)
     elements = found.generators() if isinstance(found, Group) else found
     elements = tuple(element for element in elements if not element.is_identity)
@@ -145,14 +132,9 @@ def _elements(text: str, num_agents: int) -> tuple[Element, ...]:
 def named(accepted: Sequence[Element], tried: Sequence[Element], scene: str = "") -> tuple[str, str]:
     """Return the name of the largest group that the accepted elements close to, and what `--transforms` takes.
 
-    A group of the scene counts where all of its elements that were tried are accepted, and generate it. All orders of
-    agents, or of a field's items, count where the accepted orders generate them.
-
-    Args:
-        accepted: elements that hold.
-        tried: all elements.
-        scene: a group that is no polygon's, as of legs, which is looked at too. Coupled generators, as
-            flip-x*agents-1-0, count one by one.
+    A group of the scene, as of legs, is looked at too. It counts where all of its elements that were tried are
+    accepted, and generate it; coupled generators, as flip-x*agents-1-0, count one by one. All orders of agents, or of a
+    field's items, count where the accepted orders generate them.
     """
     plane, text = _scene([e for e in accepted if not e.orders], [e for e in tried if not e.orders], scene)
     whole, single = _orders_of(accepted)

@@ -12,10 +12,8 @@ from torch import Tensor
 from esp_cli.checking.recorded import Transitions
 from esp_envs.spec import Layout
 
-STILL = 1e-6
-"""Standard deviation below which a number does not change."""
-_PLANES = 12
-"""Vectors that are looked at one by one, at most."""
+STILL = 1e-6  # standard deviation below which a number does not change
+_PLANES = 12  # vectors that are looked at one by one, at most
 _COUNT = 28
 _FEWEST = 0.8
 """An element is confronted with a function whose squared difference from its image is at least this, in variances."""
@@ -46,12 +44,7 @@ _SHAPES: tuple[Callable[[Tensor], Tensor], ...] = (
 
 
 def planes(layout: Layout, obs: Tensor) -> list[list[int]]:
-    """Return the two numbers of each vector that agents see, and the other numbers two by two; of many, every k-th.
-
-    Args:
-        layout: of what agents see.
-        obs: [M, T, N, D]; numbers that never change are left out.
-    """
+    """Return the numbers of obs [M, T, N, D] that change: vectors' two by two, and the others; of many, every k-th."""
     live = (obs.std((0, 1, 2)) > STILL).tolist()
     pairs, single = list[list[int]](), list[int]()
     for field, where in zip(layout.fields, layout.slices().values(), strict=True):
@@ -69,10 +62,6 @@ class Controls:
 
     Each has mean 0 and variance 1, and is of one of seven shapes in one vector, turned by any angle; or it says which
     agent it is.
-
-    Args:
-        layout: of what agents see.
-        data: transitions.
     """
 
     def __init__(self, layout: Layout, data: Transitions) -> None:
@@ -96,12 +85,10 @@ class Controls:
 
 
 def strength(function: Tensor, image: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Return by how much an element changes each function, mean squared [functions], and which of them count.
+    """Return the mean squared change [functions] of each function [M, T, N, functions] by an element, and which count.
 
-    Args:
-        function: [M, T, N, functions], carried along with the transitions to their images.
-        image: the functions of the images.
-        weight: [M, T, N, 1] of each step.
+    The functions are carried along with the transitions to their images; `image` are those of the images, `weight` [M,
+    T, N, 1] is of each step.
     """
     size = (weight * (image - function).square()).mean((0, 1, 2))
     return size.clamp_min(_FEWEST), size > _FEWEST

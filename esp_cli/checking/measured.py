@@ -29,9 +29,6 @@ def prepared(config: RunConfig) -> RunConfig:
     Where trust is "measured", each element gets its weight. That is the idea of PSE (Yu et al., 2024,
     arXiv:2401.00167), which quantifies the breaking during training; to measure it before, and how, is ours. What was
     measured stands in the configuration: nothing is measured twice.
-
-    Raises:
-        UserError: there is a compass, which leaves nothing to be measured, or the task cannot carry the elements.
     """
     prior = config.prior
     if prior.kind == "none":
@@ -94,13 +91,7 @@ def _discovered(make_worlds: _Maker) -> str:
 
 @lru_cache(maxsize=64)
 def _breaking(make_worlds: _Maker, transforms: str) -> tuple[tuple[str, float], ...]:
-    """Return by how many standard deviations each element's worst field is off, in any role, which share weights.
-
-    It is infinite where nobody knows.
-
-    Raises:
-        UserError: the task cannot carry the elements, or they cannot be listed.
-    """
+    """Return by how many deviations each element's worst field is off in any role; infinite where nobody knows."""
     spec, gaps = make_worlds(1, [0]).spec, dict[str, float]()
     for role in spec.roles or (spec,):
         elements = admitted_elements(transforms, unrestricted(role))  # what is weighed need not be declared
@@ -116,10 +107,7 @@ def _breaking(make_worlds: _Maker, transforms: str) -> tuple[tuple[str, float], 
 
 
 def _gap(verdict: ElementVerdict, method: str) -> float:
-    """Return by how much the worst field is off; infinite where nobody knows.
-
-    That is where a field is not covered, or is broken as far as transitions show, which can be less than it is.
-    """
+    """Return the worst field's gap; infinite where it is not covered, or broken by transitions, which may show less."""
     outcomes = {field.outcome for field in verdict.fields} | {verdict.outcome}
     if "not covered" in outcomes or (method == TRANSITIONS and "broken" in outcomes):
         return math.inf

@@ -46,23 +46,19 @@ from esp_envs.spec import Layout, TaskSpec
 _MOST_WORLDS = 256
 _NUMBERS = 1 << 18
 """Numbers that all worlds together may show their agents at once; pictures are compared in fewer worlds."""
-TOLERATED = 0.15
-"""Standard deviations that a field with chance may be off, where it is not found broken."""
-_BOUND = 0.05
-"""Where the bounded distance levels off, in standard deviations of the field."""
+TOLERATED = 0.15  # standard deviations that a field with chance may be off, where it is not found broken
+_BOUND = 0.05  # where the bounded distance levels off, in standard deviations of the field
 _ROUNDINGS, _UNCLEAR = 10.0, 0.05
 """How often what rounding does may be exceeded without being a mismatch, and the share of the states that differ by no
 more than that, from which nothing is said."""
-_SOME = 8
-"""Of more elements than these, each is first tried in one of so many states."""
+_SOME = 8  # of more elements than these, each is first tried in one of so many states
 _FEW = 0.05
 """Share of the states further out that may differ: in some that play never reaches, contacts are solved in the order
 in which a simulator numbers them."""
 _FURTHER = "holds where play went, but further out {} would differ"
 _HERE, _THERE = (101, 102), (103, 104)
 """Seeds of the two runs from the states, and of two from their images, which have chance of their own."""
-Outcomes = dict[str, Tensor]
-"""What a step gives, by field: [M, numbers]."""
+Outcomes = dict[str, Tensor]  # what a step gives, by field: [M, numbers]
 
 
 def check_paired(
@@ -73,19 +69,11 @@ def check_paired(
     until: float = math.inf,
     spare: float = math.inf,
 ) -> list[ElementVerdict]:
-    """Judge elements on a task that can be set to a state.
+    """Judge elements on a task that can be set to a state, with outcomes of at most `most` worlds.
 
     Of many elements, each is first tried in an eighth of the states: what is broken there is broken. What holds in all
     states that were visited is tried further out, too, where random play does not go: an element that is broken there
-    is not covered.
-
-    Args:
-        make: makes E worlds for some seeds.
-        elements: to try.
-        most: worlds in which outcomes are compared, at most.
-        watch: told of how many steps of how many are taken to visit states, then of how many elements are judged.
-        until: when to stop, see `verdicts_of`.
-        spare: when to stop with what nobody declared.
+    is not covered. `until` and `spare` as in `verdicts_of`.
     """
     shown = make(1, [0]).spec
     worlds = max(64, min(most or _MOST_WORLDS, _NUMBERS // (shown.num_agents * shown.observation.width)))
@@ -122,16 +110,7 @@ def check_paired(
 
 
 class _Pairs:
-    """Steps from some states, to be compared with steps from their images.
-
-    Args:
-        make: makes E worlds for some seeds.
-        visited: states [1, E, state width] and joint actions, for each moment.
-        until: when to stop.
-
-    Raises:
-        Late: it is later than that, here or in `judge`.
-    """
+    """Steps from visited states [1, E, state width], compared with steps from their images; after `until`, `Late`."""
 
     def __init__(self, make: MakeWorlds, visited: Sequence[tuple[Tensor, Tensor]], until: float) -> None:
         self._visited, self._until, worlds = visited, until, visited[0][0].shape[1]
@@ -176,12 +155,8 @@ class _Pairs:
 def _verdict(name: str, x: Tensor, x2: Tensor, y: Tensor, near: Tensor) -> FieldVerdict | None:
     """Judge one field from its outcomes [M, numbers] state by state, where that tells; else return None.
 
-    Args:
-        name: the field's.
-        x: transformed outcomes.
-        x2: the same with other chance.
-        y: outcomes from the transformed states, with the chance of x.
-        near: transformed outcomes from states that differ by about a rounding, with the chance of x.
+    `x` are transformed outcomes, `x2` the same with other chance, `y` outcomes from the transformed states with the
+    chance of `x`, `near` transformed ones from states that differ by about a rounding, with the chance of `x` too.
     """
     (x, x2, y), known = _known(x, x2, y)
     if not len(x):

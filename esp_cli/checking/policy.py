@@ -18,38 +18,20 @@ from esp_envs.errors import UserError
 from esp_envs.promises import MakeWorlds
 
 _WORLDS, _STEPS = 64, 10
-CLOSE = 0.1
-"""Continuous actions nearer than this, in every number, count as the same."""
+CLOSE = 0.1  # continuous actions nearer than this, in every number, count as the same
 
 
 @dataclass(frozen=True)
 class PolicyVerdict:
-    """How a policy acts under an element.
-
-    Attributes:
-        element: its name.
-        agreement: share of agents and states in which the greedy action transforms as it should, of continuous actions
-            within 0.1 in every number.
-        distance: of continuous actions, how far they are from that: 0 nowhere, 1 as far apart as actions of unrelated
-            states; None of discrete ones.
-    """
+    """How a policy acts under an element."""
 
     element: str
-    agreement: float
-    distance: float | None = None
+    agreement: float  # share of agents and states whose greedy action transforms; continuous ones within 0.1
+    distance: float | None = None  # of continuous actions: 1 as far apart as actions of unrelated states
 
 
 def check_policy(trained: TrainedPolicy, make: MakeWorlds, transforms: str | None = None) -> list[PolicyVerdict]:
-    """Measure how symmetric a policy's greedy actions are in the first steps of its own episodes.
-
-    Args:
-        trained: one or several seeds of a policy for this task.
-        make: makes E worlds for some seeds.
-        transforms: which elements; see `check_symmetry`.
-
-    Raises:
-        UserError: the policy is of another task.
-    """
+    """Measure how symmetric a policy's greedy actions are in its own episodes' first steps; see `check_symmetry`."""
     env = with_compass(make(_WORLDS, trained.config.seeds), trained.config.prior)
     if (env.spec.observation, env.spec.action) != (trained.spec.observation, trained.spec.action):
         raise UserError(f"{trained.source} is a policy of {trained.config.task}, which sees or does other things")

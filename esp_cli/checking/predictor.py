@@ -17,26 +17,18 @@ _HIDDEN, _BATCH, _UPDATES, _RATE = 64, 256, 600, 5e-3
 _RIDGE, _LEAST = 1e-2, 1e-9
 _WIDEST_PAIRS, _WIDEST_OTHERS = 48, 160
 """Most numbers of one agent whose products are looked at, and of all other agents, beyond which they only act."""
-_BUMPS, _BREADTH = 32, 0.6
-"""Bumps for each vector, and how broad one is, in standard deviations of the vector."""
+_BUMPS, _BREADTH = 32, 0.6  # bumps for each vector, and how broad one is, in standard deviations of the vector
 _CELLS = 24
 """Parts of each number of a vector, of equally many steps: what has sharp edges is averaged in the cells of both."""
 _ROUNDING = 1e-3
-_CHUNK = 512
-"""Episodes whose features are held at once."""
+_CHUNK = 512  # episodes whose features are held at once
 
 
 class Predictor:
-    """Predicts numbers of each agent and step from what agents see and do.
+    """Predicts `outputs` [M, T, N, O] of each agent and step from what agents see and do, and `functions` [M, T, N, B].
 
     The regression is on what all agents see and do, products of two of an agent's own numbers, what each agent does,
-    and bumps of each vector.
-
-    Args:
-        spaces: what the numbers are.
-        data: transitions to fit.
-        outputs: [M, T, N, O], what follows.
-        functions: [M, T, N, B], predicted by the regression alone.
+    and bumps of each vector. It alone predicts the functions.
     """
 
     def __init__(self, spaces: Spaces, data: Transitions, outputs: Tensor, functions: Tensor) -> None:
@@ -129,12 +121,7 @@ def done(data: Transitions, spaces: Spaces) -> Tensor:
 
 
 class _Cells:
-    """Means in the cells of each vector, one vector after the other, shrunk as far as noise would make them.
-
-    Args:
-        vectors: [rows, planes, 2].
-        y: [rows, outputs].
-    """
+    """Means of y [rows, O] in cells of each vector [rows, planes, 2] in turn, shrunk as far as noise makes them."""
 
     def __init__(self, vectors: Tensor, y: Tensor) -> None:
         levels = torch.linspace(0, 1, _CELLS + 1)[1:-1]

@@ -19,8 +19,7 @@ from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, Spaces
 
 EPISODES = 2048
-STEPS = 8
-"""Steps of each episode that are looked at."""
+STEPS = 8  # steps of each episode that are looked at
 _MOST_BYTES = 2**31
 _NEEDED, _OPTIONAL = ("obs", "action", "reward", "next_obs"), ("action_mask",)
 
@@ -57,10 +56,10 @@ def collect(
     until: float = math.inf,
     watch: Watch = lambda *_: None,
 ) -> Transitions:
-    """Return the first steps of episodes of the random policy.
+    """Return the first steps of random episodes, of which one that ends earlier repeats its last transition.
 
-    An episode that ends earlier repeats its last transition. After `until`, by `time.monotonic`, no step is begun:
-    episodes that are under way are left out, of the first ones the steps that are missing.
+    After `until`, by `time.monotonic`, no step is begun: episodes that are under way are left out, of the first ones
+    the steps that are missing.
     """
     worlds = env.num_envs * env.num_seeds
     rounds, count = -(-episodes // worlds), min(steps, env.spec.horizon)

@@ -11,21 +11,13 @@ from torch import Tensor
 from esp_envs.errors import UserError
 from esp_envs.spec import Field, Layout, Spaces
 
-SHIFT = "shift"
-"""Its name as a check takes it; no prior needs it, as networks over sets see no place of such a task."""
+SHIFT = "shift"  # its name as a check takes it; no prior needs it, as networks over sets see no place of such a task
 _BY = (1.25, -0.75)  # in the unit of a place: float32 adds it with little rounding
 
 
 @dataclass(frozen=True, eq=False)
 class Shift:
-    """Moves every place (`Field.is_point`) of a task by one vector; actions, vectors and agents stay.
-
-    Raises:
-        UserError: the state has no place.
-
-    Example:
-        Shift(spaces).state(x) adds 1.25 and -0.75 to columns 0 and 1 where a place lies there.
-    """
+    """Moves every place (`Field.is_point`) of a task by (1.25, -0.75); actions, vectors and agents stay."""
 
     spaces: Spaces
     name: str = SHIFT

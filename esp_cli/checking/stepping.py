@@ -21,10 +21,8 @@ from esp_envs.errors import UserError
 from esp_envs.spec import Continuous, Layout, TaskSpec
 from esp_envs.views import OthersAtRandom, RoleView
 
-MOMENTS = 8
-"""Points of an episode at which states are taken."""
-_NUDGE = 1e-6
-"""How far a state is moved to see what rounding does."""
+MOMENTS = 8  # points of an episode at which states are taken
+_NUDGE = 1e-6  # how far a state is moved to see what rounding does
 
 
 def visit(env: Environment, watch: Watch, until: float, early: bool = False) -> list[tuple[Tensor, Tensor]]:
@@ -60,12 +58,8 @@ def outcomes(
 ) -> list[Step]:
     """Return the steps from each moment's states; the start's observation replaces `next` of the episode's end.
 
-    Args:
-        env: the worlds. Agents of other roles act at random, alike in each run, in images turned.
-        visited: states [1, E, state width] and joint actions, for each moment.
-        turned: what makes the images, None for the states themselves.
-        seed: of the run's chance.
-        until: when to stop, see `verdicts_of`.
+    `turned` makes the images, None the states themselves. Agents of other roles act at random with the run's `seed`,
+    alike in each run, in images turned.
     """
     _begin(env, len(visited), turned, seed)
     steps = []

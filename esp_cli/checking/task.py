@@ -33,25 +33,15 @@ _SEVERAL = "no state holds these items, and each agent's transitions do not show
 
 @dataclass(frozen=True)
 class SymmetryReport:
-    """What a check found.
+    """What a check found."""
 
-    Attributes:
-        task: its name, or the file of transitions.
-        method: "paired states" or "transitions".
-        declared: the symmetry that the task declares.
-        found: the largest group whose tried elements all hold: "d4*agents", "flip-x", "c1" for nothing.
-        transforms: what `--transforms` takes to use it; empty where nothing was found.
-        elements: one verdict for each element that was tried.
-        refused: why elements that were asked for could not be tried, by their names.
-    """
-
-    task: str
-    method: str
+    task: str  # its name, or the file of transitions
+    method: str  # "paired states" or "transitions"
     declared: str
-    found: str
-    transforms: str
+    found: str  # the largest group whose tried elements all hold: "d4*agents", "flip-x", "c1" for nothing
+    transforms: str  # what `--transforms` takes to use it; empty where nothing was found
     elements: tuple[ElementVerdict, ...]
-    refused: Mapping[str, str]
+    refused: Mapping[str, str]  # why elements that were asked for could not be tried, by their names
 
     @property
     def broken(self) -> tuple[str, ...]:
@@ -82,18 +72,10 @@ def check_symmetry(
 ) -> SymmetryReport:
     """Judge for each element and field whether a task is symmetric.
 
-    Args:
-        make: makes E worlds for some seeds.
-        transforms: which elements, as `--transforms` takes them, or "shift"; by default those of `candidates`, and a
-            shift where the task declares that it changes nothing.
-        from_transitions: use transitions of the random policy even where the task can be set to states.
-        watch: told of how many steps of how many are collected, then of how many elements are judged.
-        seconds: after which elements that are left are not covered; declared ones are tried first. No more than half
-            of the time that is left goes to collecting.
-        spare: seconds after which no more elements are tried that nobody declared.
-
-    Raises:
-        UserError: the transforms mean nothing, or the task can carry none of them.
+    Elements are those of `--transforms`, or "shift"; by default those of `candidates`, and a shift where the task
+    declares that it changes nothing. `watch` is told of how many steps of how many are collected, then of elements.
+    After `seconds` the elements that are left are not covered; declared ones are tried first, and after `spare` seconds
+    no others. No more than half of the time that is left goes to collecting.
     """
     until, spare = time.monotonic() + seconds, time.monotonic() + spare
     spec = make(1, [0]).spec
@@ -127,10 +109,7 @@ def judged(
     until: float = math.inf,
     spare: float = math.inf,
 ) -> tuple[str, list[ElementVerdict]]:
-    """Return the method that a task allows, and what it says of some elements until the time is over.
-
-    A shift comes last.
-    """
+    """Return the method that a task allows, and what it says of elements until time is over; a shift comes last."""
     probe = make(1, [0])
     seen, native = probe.spec, probe.has("set_state")
     if from_transitions or not probe.settable():

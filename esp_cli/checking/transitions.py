@@ -27,30 +27,18 @@ from esp_cli.checking.candidates import is_declared
 from esp_cli.checking.controls import STILL, Controls, Sides, strength, trust_in
 from esp_cli.checking.predictor import Predictor, done
 from esp_cli.checking.recorded import Transitions, outputs_of, turned
-from esp_cli.checking.verdicts import (
-    SIGNIFICANT,
-    ElementVerdict,
-    FieldVerdict,
-    Watch,
-    concluded,
-    verdicts_of,
-)
+from esp_cli.checking.verdicts import SIGNIFICANT, ElementVerdict, FieldVerdict, Watch, concluded, verdicts_of
 from esp_cli.symmetry import Element, Transform, build_transform
 from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, Spaces
 
-FEWEST = 64
-"""Episodes (or single transitions) below which nothing can be told."""
-TOLERATED = 0.2
-"""Standard deviations of a field that a step from the image may differ from the step's image."""
+FEWEST = 64  # episodes (or single transitions) below which nothing can be told
+TOLERATED = 0.2  # standard deviations of a field that a step from the image may differ from the step's image
 _SEEN = 0.1
 """Share of the tolerance, squared, from which a gap that is no chance is a breaking: predictors are never exact."""
-_DOUBTFUL = 4.0
-"""Standard errors from which such a gap is no breaking yet, but leaves an element uncovered."""
-_HIDES = 0.25
-"""Share of the variance of rewards from which on the rarest hundredth of them hides what is usual."""
-_MOST_ROWS = 1 << 15
-"""Steps of agents that are looked at, at most; of more episodes every k-th step."""
+_DOUBTFUL = 4.0  # standard errors from which such a gap is no breaking yet, but leaves an element uncovered
+_HIDES = 0.25  # share of the variance of rewards from which on the rarest hundredth of them hides what is usual
+_MOST_ROWS = 1 << 15  # steps of agents that are looked at, at most; of more episodes every k-th step
 _FEWEST_INSIDE = 0.5
 """Share of the images that lie where transitions do, below which they show nothing; these alone are judged."""
 _PREFERS, _ELSEWHERE = 0.05, 0.5
@@ -65,17 +53,9 @@ def check_transitions(
     watch: Watch = lambda *_: None,
     until: float = math.inf,
 ) -> list[ElementVerdict]:
-    """Judge elements from transitions.
+    """Judge elements from 64 episodes or more of anybody's transitions, of a policy that prefers no direction.
 
-    Args:
-        spaces: what the numbers are, and the declared symmetry.
-        data: anybody's transitions, of a policy that prefers no direction; each episode counts once.
-        elements: to try.
-        watch: told of how many elements of how many are judged.
-        until: when to stop, see `verdicts_of`.
-
-    Raises:
-        UserError: fewer than 64 episodes, numbers that are not finite, or actions outside the task's.
+    Each episode counts once. `watch` is told of how many elements of how many are judged; `until` as in `verdicts_of`.
     """
     data = Transitions(*(x.float() if x.is_floating_point() else x for x in vars(data).values() if x is not None))
     _refuse_what_says_nothing(spaces, data)
@@ -126,11 +106,8 @@ def _judge(element: Element, spaces: Spaces, halves: Sequence[_Half], first: Tra
 def _judged(name: str, alone: Tensor, squares: Tensor, planted: Tensor) -> FieldVerdict:
     """Judge one field by how much larger errors are on images, as shares of the variance.
 
-    Args:
-        name: the field's.
-        alone: [M] squared errors of what follows.
-        squares: [M] those of its square.
-        planted: [M, functions] those of what follows with a breaking of the tolerance's size.
+    `alone` [M] are squared errors of what follows, `squares` [M] those of its square, and `planted` [M, functions]
+    those of what follows with a breaking of the tolerance's size.
     """
     gap, error = _mean(alone)
     p_value = 1.0
@@ -147,13 +124,7 @@ def _judged(name: str, alone: Tensor, squares: Tensor, planted: Tensor) -> Field
 
 
 class _Half:
-    """A predictor of one half of the episodes, and what it errs by on the other.
-
-    Attributes:
-        held: the other.
-        fields: which outputs are of which field.
-        spread: variance of each output.
-    """
+    """A predictor of one half of the episodes, and what it errs by on the other, which is `held`."""
 
     def __init__(self, spaces: Spaces, controls: Controls, fitted: Transitions, held: Transitions) -> None:
         outputs, width = outputs_of(fitted), spaces.observation.width
@@ -208,15 +179,12 @@ class _Half:
 class _Compared(NamedTuple):
     """How errors on images compare with those on originals.
 
-    Attributes:
-        inside: share of the images that lie where transitions do.
-        counts: which controls the element changes, [functions] bool.
-        fields: by field, as shares of the variance, excess of squared errors [M], of those of squares [M], and with
-            each control planted [M, functions].
+    Of each field, as shares of the variance, there are the excess of squared errors [M], of those of squares [M], and
+    with each control planted [M, functions].
     """
 
-    inside: float
-    counts: Tensor
+    inside: float  # share of the images that lie where transitions do
+    counts: Tensor  # which controls the element changes, [functions] bool
     fields: dict[str, tuple[Tensor, ...]]
 
 
@@ -254,10 +222,7 @@ def _refuse_what_says_nothing(spaces: Spaces, data: Transitions) -> None:
 
 
 def _without_tails(reward: Tensor) -> Tensor:
-    """Return rewards of which the rarest hundredth counts as the next, if it hides what is usual.
-
-    Others stay as they are: where a law ends, no regression on few transitions follows it.
-    """
+    """Return rewards with the rarest hundredth clamped where it hides what is usual: no regression follows it."""
     low, high = torch.quantile(reward.flatten()[: 1 << 24], torch.tensor([0.005, 0.995])).tolist()
     clamped = reward.clamp(low, high)
     return clamped if low < high and clamped.var() < (1 - _HIDES) * reward.var() else reward

@@ -19,11 +19,9 @@ RANK: dict[Outcome, int] = {"holds": 0, "not covered": 1, "broken": 2}
 """The outcome of several verdicts is the one of the highest rank."""
 SIGNIFICANT = 6.0
 """Standard errors that a gap must exceed to be a breaking: with thousands of comparisons, chance alone reaches 4."""
-NEGLIGIBLE = 1e-3
-"""Gap against the field's spread below which a difference is rounding."""
+NEGLIGIBLE = 1e-3  # gap against the field's spread below which a difference is rounding
 LATE = "not tried, as the time was over"
-LEVEL = 0.05
-"""Probability with which an element that is off by the tolerance may be said to hold, at most."""
+LEVEL = 0.05  # probability with which an element that is off by the tolerance may be said to hold, at most
 
 
 Named = TypeVar("Named", bound=Element | Shift)
@@ -41,40 +39,24 @@ def stop_at(until: float) -> None:
 
 @dataclass(frozen=True)
 class FieldVerdict:
-    """What was found of one field under one element.
+    """What was found of one field under one element."""
 
-    Attributes:
-        field: its name, with the space before it: "obs.velocity", "state.position", "reward", "end".
-        outcome: whether it transforms as it says; "not covered" where the data could not have shown a breaking.
-        gap: how far it is from that, in standard deviations of the field.
-        error: standard error of the gap.
-        p_value: how likely a gap this small is, if the field is off by the tolerance or more.
-        share: of the states, those that differ; NaN where chance decides what follows.
-    """
-
-    field: str
-    outcome: Outcome
-    gap: float
-    error: float
-    p_value: float = 1.0
-    share: float = math.nan
+    field: str  # with the space before it: "obs.velocity", "state.position", "reward", "end"
+    outcome: Outcome  # "not covered" where the data could not have shown a breaking
+    gap: float  # how far it is from transforming as it says, in standard deviations of the field
+    error: float  # standard error of the gap
+    p_value: float = 1.0  # how likely a gap this small is, if the field is off by the tolerance or more
+    share: float = math.nan  # of the states, those that differ; NaN where chance decides what follows
 
 
 @dataclass(frozen=True)
 class ElementVerdict:
-    """What was found of one element.
+    """What was found of one element."""
 
-    Attributes:
-        element: its name, as `--transforms` takes it.
-        declared: whether the task's declared symmetry holds it.
-        fields: one verdict for each field.
-        reason: why the whole element is not covered, if so.
-    """
-
-    element: str
-    declared: bool
+    element: str  # its name, as `--transforms` takes it
+    declared: bool  # whether the task's declared symmetry holds it
     fields: tuple[FieldVerdict, ...]
-    reason: str = ""
+    reason: str = ""  # why the whole element is not covered, if so
 
     @property
     def worst(self) -> FieldVerdict | None:
@@ -115,15 +97,10 @@ def verdicts_of(
     until: float = math.inf,
     spare: float = math.inf,
 ) -> list[ElementVerdict]:
-    """Judge elements, declared ones first, and tell how many are done.
+    """Judge elements, declared ones first, and tell how many of how many are done.
 
-    Args:
-        elements: to judge.
-        judge: what judges one.
-        is_declared: whether the task declares one.
-        watch: told of how many elements of how many are judged.
-        until: reading of `time.monotonic` from which on an element is not covered, as it is not tried.
-        spare: the same for elements that nobody declared.
+    `until` is the reading of `time.monotonic` from which on an element is not tried and so not covered, `spare` the
+    same for elements that nobody declared.
     """
     found = dict[Named, ElementVerdict]()
     for done, element in enumerate(sorted(elements, key=lambda one: not is_declared(one)), 1):

@@ -67,8 +67,7 @@ def train(
     config: Annotated[
         Path | None,
         typer.Option(
-            "--config",
-            help="Read settings from a run, its config.json, or a JSON or TOML file; options override them.",
+            "--config", help="Read settings from a run, its config.json, or a JSON or TOML file; options override them."
         ),
     ] = None,
     print_config: Annotated[
@@ -85,8 +84,7 @@ def train(
     track: Annotated[
         list[str] | None,
         typer.Option(
-            "--track",
-            help="Also send metrics to tensorboard, wandb or mlflow, offline in the run folder; repeatable.",
+            "--track", help="Also send metrics to tensorboard, wandb or mlflow, offline in the run folder; repeatable."
         ),
     ] = None,
     watch: Annotated[

@@ -145,8 +145,7 @@ class Network(nn.Module, ABC):
     """S networks of one shape; `memory` is what they carry from step to step ([S, B, 0] if nothing)."""
 
     memory_width = 0
-    team = 1
-    """Rows that are read together: the agents of a world, side by side, where they exchange messages."""
+    team = 1  # rows that are read together: the agents of a world, side by side, where they exchange messages
 
     def initial_memory(self, num_seeds: int, batch: int, like: Tensor) -> Tensor:
         """Return the empty memory [S, B, H] of a new episode."""

@@ -14,8 +14,7 @@ from esp_cli.symmetry.representation import layout_operator
 from esp_envs.errors import UserError
 from esp_envs.spec import ActionSpace, Discrete, Kind, Layout
 
-LOCAL = "local-"
-"""Begins the name of a group whose elements are chosen by the input's frame, as "local-d4"."""
+LOCAL = "local-"  # begins the name of a group whose elements are chosen by the input's frame, as "local-d4"
 
 
 class Symmetrised(Network):

@@ -197,9 +197,7 @@ def load_policy(
 
 
 def register_own(
-    task: str | type[Environment] | None,
-    algo: str | type[Learner] | None,
-    network: str | type[NetworkConfig] | None,
+    task: str | type[Environment] | None, algo: str | type[Learner] | None, network: str | type[NetworkConfig] | None
 ) -> None:
     """Register the task, algorithm and network that a caller names; see `Registry.register`."""
     if task is not None:

@@ -62,8 +62,7 @@ class PriorConfig(Strict):
     )
     doubt: float = Field(8.0, ge=0, le=1000, description="what is off by b s.d. weighs exp(-doubt b)")
     weights: dict[str, Annotated[float, Field(ge=0, le=1)]] = Field(
-        {},
-        description="weight of each element by its name, 0 leaves it out; filled in where trust is measured",
+        {}, description="weight of each element by its name, 0 leaves it out; filled in where trust is measured"
     )
 
     @model_validator(mode="before")

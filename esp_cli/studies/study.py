@@ -21,14 +21,7 @@ from typing import Literal
 from pydantic import Field, ValidationError
 
 from esp_cli.defaults import __version__
-from esp_cli.files.documents import (
-    MAX_DOCUMENT_BYTES,
-    DocumentError,
-    DocumentFormat,
-    Strict,
-    parse_object,
-    validate,
-)
+from esp_cli.files.documents import MAX_DOCUMENT_BYTES, DocumentError, DocumentFormat, Strict, parse_object, validate
 from esp_cli.files.formatting import shortened
 from esp_cli.files.opening import open_own, read_regular, require_held
 from esp_cli.files.writing import remove_file

@@ -76,9 +76,7 @@ def save_checkpoint(
 
 
 def load_checkpoint(
-    path: str | os.PathLike[str],
-    format_name: str = CHECKPOINT_FORMAT,
-    sha256: str | None = None,
+    path: str | os.PathLike[str], format_name: str = CHECKPOINT_FORMAT, sha256: str | None = None
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Read and verify what `save_checkpoint` wrote, and a SHA-256 of the whole file where a manifest states one."""
     with _naming(path):

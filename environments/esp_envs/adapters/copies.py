@@ -132,11 +132,7 @@ def _answer(pipe: Connection, worker: ForkProcess) -> str:
 
 
 def _work(
-    pipe: Connection,
-    ends_of_the_parent: Sequence[Connection],
-    make_stepper: MakeStepper,
-    board: Board,
-    share: range,
+    pipe: Connection, ends_of_the_parent: Sequence[Connection], make_stepper: MakeStepper, board: Board, share: range
 ) -> None:
     for stop in (signal.SIGINT, signal.SIGTERM):  # the parent stops in its own time, and then closes the pipe
         signal.signal(stop, signal.SIG_IGN)

@@ -23,10 +23,7 @@ _ADVICE = {
     _AEC: "wrap it in pettingzoo.utils.aec_to_parallel",
     _VECTOR: "return one environment; the copies are made here",
 }
-_PARTS = {
-    "reset": ("observations", "infos"),
-    "step": ("observations", "rewards", "terminated", "truncated", "infos"),
-}
+_PARTS = {"reset": ("observations", "infos"), "step": ("observations", "rewards", "terminated", "truncated", "infos")}
 _TURNS, _MIRRORS, _HALF = r"(o2|so2|[cd](?!1\b)\d+)", r"(o2|d\d|flip)", ("c2", "d2")
 """Symmetries of the scene that turn a vector, that mirror it, and that turn it by a half at most."""
 EVERYONE = "__all__"  # the entry of a mapping of flags that speaks of all agents

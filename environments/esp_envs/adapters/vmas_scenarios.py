@@ -200,10 +200,7 @@ Football = _scenario(
     "c1",
     agents=6,
     arguments=lambda _: {"ai_red_agents": False},
-    seen=lambda _: {
-        "agent_blue": _player("agent_red"),
-        "agent_red": _player("agent_blue"),
-    },
+    seen=lambda _: {"agent_blue": _player("agent_red"), "agent_red": _player("agent_blue")},
 )
 Flocking = _scenario("flocking", "c1", *_OWN, *_vectors("from_target"), Field("lidar", Kind.RING, rays=12), agents=4)
 GiveWay = _scenario("give_way", "c1", *_OWN, agents=2, fixed=True, own_goals="goal")

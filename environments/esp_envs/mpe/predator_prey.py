@@ -217,11 +217,7 @@ class PredatorPrey(ParticleTask):
         touches = paid = _touches(square)
         if self.settings.reward_offset:
             paid = _touches(self._squared_to(position[predators:])[:predators, 0])
-        metrics = {
-            "contact": touches.clamp_max(1.0),
-            "touches": touches,
-            "prey_distance": square.amin(0).sqrt(),
-        }
+        metrics = {"contact": touches.clamp_max(1.0), "touches": touches, "prey_distance": square.amin(0).sqrt()}
         reward = paid * TOUCH_REWARD
         if self._prey_learns:
             hunted = -reward - out_of_bounds(position[predators] / self.settings.half_side).sum(0)
