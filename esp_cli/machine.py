@@ -16,9 +16,9 @@ def prepare() -> None:
     """Tune thread waiting and memory for training; what the user has set in the environment stays.
 
     OpenMP's threads wait for each other by spinning, by default for milliseconds: a second busy program on the same
-    cores then slows training tenfold and more. glibc gives large tensors back to the kernel as soon as they are
-    freed, and every new one costs its page faults again: kept, they make a recurrent update 1.4 times as fast. Large
-    pages for tensors of megabytes, where Linux gives them, make training a little faster.
+    cores then slows training tenfold and more. glibc gives large tensors back to the kernel as soon as they are freed,
+    and every new one costs its page faults again: kept, they make a recurrent update 1.4 times as fast. Large pages for
+    tensors of megabytes, where Linux gives them, make training a little faster.
     """
     os.environ.setdefault("GOMP_SPINCOUNT", "10000")  # read when torch is imported
     os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")  # read at the first tensor

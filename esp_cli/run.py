@@ -183,10 +183,7 @@ def plan(
     device: str,
     init_from: str | os.PathLike[str] | Start | None,
 ) -> tuple[RunConfig, dict[str, Tensor] | None]:
-    """Return the configuration of a new run, and the weights that it starts from; arguments and errors as of `train`.
-
-    What does not go together is refused here, before a run folder exists. What the caller brings along is registered.
-    """
+    """Return the configuration of a new run and its first weights, as `train`; refuse what does not go together."""
     if isinstance(seeds, int):
         raise UserError(f"seeds are the numbers of the seeds, not how many; write seeds=range({seeds})")
     config = prepared(resolve_config(task, algo, preset, steps, seeds, resolve_device(device), settings))

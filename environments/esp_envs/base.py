@@ -82,12 +82,7 @@ def random_choice(allowed: Tensor, number: Tensor) -> Tensor:
 
 
 def joined(parts: Sequence[Tensor]) -> Tensor:
-    """Return what the agents of all roles see or do as one tensor.
-
-    Args:
-        parts: of each role rows of numbers [..., agents, width], which get zeros behind them up to the widest, or
-            integers [..., agents], discrete actions.
-    """
+    """Return as one tensor what agents of all roles see or do: integers [..., agents], or rows padded to the widest."""
     if len(parts) == 1:
         return parts[0]
     if not parts[0].is_floating_point():

@@ -222,10 +222,7 @@ QUICK = (observations_rewards_and_metrics_fit_the_spec, the_same_seed_gives_the_
 
 
 def check(subject: Subject, promises: Sequence[Callable[[Subject], None]] = PROMISES) -> Iterator[Finding]:
-    """Check promises in turn; a task that raises breaks the promise, and only the first where all fail alike.
-
-    Each but the last has at most half of the time that is left, so that long ones leave some for the others.
-    """
+    """Check promises in turn, each but the last in half of the time left; where all fail alike, only the first."""
     raised: set[str] = set()
     for promise in promises:
         name = promise.__name__.replace("_", " ")

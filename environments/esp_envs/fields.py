@@ -183,9 +183,8 @@ class Placed(NamedTuple):
 class Family:
     """A set of like things in a row: `count` items, each the numbers of several fields side by side.
 
-    Example:
-        Family("others", 2, (Placed(position, slice(10, 14)), Placed(velocity, slice(14, 18)))) has two items of
-        four numbers: 10, 11, 14, 15 and 12, 13, 16, 17 of the row.
+    Family("others", 2, (Placed(position, slice(10, 14)), Placed(velocity, slice(14, 18)))) has two items of four
+    numbers: 10, 11, 14, 15 and 12, 13, 16, 17 of the row.
     """
 
     name: str

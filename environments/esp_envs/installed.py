@@ -33,12 +33,8 @@ _MODULE_AND_NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 class Registry(Mapping[str, type[T]]):
     """The classes of one kind by name. A class that is built in or installed is imported when it is looked up.
 
-    Args:
-        noun: what messages call one of them, as "task"; their entry points are in the group "esp.tasks".
-        built_in: name -> "module:Class".
-        base: "module:Class" of the class that every one of them derives from.
-        option: by which a command takes a name.
-        example: a name that a user may write.
+    `noun` is what messages call one of them, as "task", whose entry points are in the group "esp.tasks"; `base` is the
+    "module:Class" of which every one is, and a command takes a name, such as `example`, by `option`.
     """
 
     def __init__(self, noun: str, built_in: Mapping[str, str], base: str, option: str, example: str) -> None:
@@ -118,10 +114,7 @@ class Registry(Mapping[str, type[T]]):
 
 
 def import_named(name: str, noun: str, kind: str, example: str) -> Any:
-    """Import what a user named as "module:Class" or "module:function", whichever the kind is; `noun` is what it is for.
-
-    The working directory is importable while the module is imported, as it is for a script.
-    """
+    """Import what a user named as "module:Class" or "module:function" for a `noun`, also from the working directory."""
     if not _MODULE_AND_NAME.fullmatch(name):
         raise UserError(f"'{name[:80]}' names no {noun}; write module:{kind}, as in {example}")
     module_name, attribute = name.split(":")

@@ -83,13 +83,9 @@ def holders(scene: Scene) -> dict[int, int]:
 
 
 class Painter(Protocol):
-    """What draws scenes.
+    """What draws scenes."""
 
-    Attributes:
-        note: a sentence for the user about how it draws, or None.
-    """
-
-    note: str | None
+    note: str | None  # a sentence for the user about how it draws, or None
 
     def draw(self, scene: Scene, trail: Sequence[Scene] = ()) -> NDArray[np.uint8]:
         """Draw one scene with the trails of earlier ones, oldest first: [H, W, 3] uint8, RGB, the top row first."""

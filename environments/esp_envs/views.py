@@ -24,15 +24,7 @@ def _of_the_worlds(method: str) -> Any:
 
 
 class RoleView(Environment):
-    """The worlds of a task as one role meets them: its agents, what they see, do and get.
-
-    Args:
-        turns: steps the worlds.
-        role: its name.
-
-    Example:
-        prey = RoleView(OthersAtRandom(make("tag:Tag", 8, (0,))), "prey")
-    """
+    """The worlds of a task as one role meets them: its agents, what they see, do and get; `turns` steps the worlds."""
 
     settable, has = map(_of_the_worlds, ("settable", "has"))
 
@@ -102,10 +94,9 @@ class RoleView(Environment):
 
 
 class OthersAtRandom:
-    """Worlds in which the agents of all other roles act at random, for checks of one role.
+    """Worlds in which agents of other roles act at random, for checks of one role.
 
-    Attributes:
-        image: what makes of a random joint action the one that is done, as in a scene that was turned.
+    `image` makes of a random joint action the one that is done, as in a scene that was turned.
     """
 
     def __init__(self, env: Environment) -> None:
@@ -130,8 +121,7 @@ def worlds_of_role(make: MakeWorlds, role: str) -> MakeWorlds:
 class Lockstep:
     """Worlds that learners of all roles step together, each learner in a thread of its own.
 
-    One of them computes at a time, so nothing depends on which is faster. A learner that asks for a step or a new
-    episode waits until all have; then the worlds step once.
+    One of them computes at a time, so nothing depends on which is faster. Worlds step once when all have asked.
     """
 
     def __init__(self, env: Environment) -> None:

@@ -16,12 +16,7 @@ BETAS = (0.9, 0.999)
 
 
 class SeedParameters:
-    """Parameters of S seeds as views of one buffer; changing the buffer changes the networks.
-
-    Attributes:
-        parameters: as given.
-        buffer: [S, P] all numbers of a seed in a row.
-    """
+    """Parameters of S seeds as views of one buffer [S, P]; changing the buffer changes the networks."""
 
     def __init__(self, parameters: Sequence[nn.Parameter]) -> None:
         self.parameters = list(parameters)
@@ -42,8 +37,7 @@ class SeedParameters:
     def sum(self, gradients: Sequence[tuple[Sequence[Tensor], Sequence[Tensor]]]) -> Tensor:
         """Return a new buffer [S, P] of the sum of gradients by some of the parameters.
 
-        Args:
-            gradients: parameters that follow each other here, and the gradients by them, or one by all side by side.
+        These follow each other here, with the gradients by each of them, or one by all side by side.
         """
         parts, rest = [], []
         at = 0
@@ -66,19 +60,10 @@ class SeedParameters:
 
 
 class SeedAdam:
-    """Adam (Kingma and Ba, 2015) for S seeds, with the gradients of each seed clipped.
+    """Adam (Kingma and Ba, 2015) for S seeds, with the gradients of each seed clipped to a joint norm in each group.
 
     m <- b1 m + (1 - b1) g, v <- b2 v + (1 - b2) g^2, p <- p - lr (m / (1 - b1^t)) / (sqrt(v / (1 - b2^t)) + epsilon).
-
-    Args:
-        groups: parameters [S, ...]; the gradients of a group are clipped by their joint norm.
-        learning_rate: lr before it is annealed.
-        epsilon: see above.
-        max_grad_norm: largest norm of the gradients of a group and seed.
-
-    Attributes:
-        learning_rate: lr of the next step.
-        parameters: of all groups.
+    `learning_rate` is lr of the next step, as it may be annealed.
     """
 
     def __init__(
@@ -156,11 +141,7 @@ class SeedAdam:
 
 
 def clip_per_seed(groups: Sequence[Tensor], max_norm: float) -> list[Tensor]:
-    """Scale each seed's gradients of every group [S, P] in place to a norm of at most `max_norm`.
-
-    Returns:
-        The norms [S] before, by group.
-    """
+    """Scale each seed's gradients of every group [S, P] in place to at most `max_norm`; return norms [S] before."""
     norms = torch.stack([torch.linalg.vector_norm(gradient, dim=1) for gradient in groups])
     if norms.is_cpu and norms.max().item() + 1e-6 <= max_norm:  # a GPU would be waited for
         return [*norms.unbind(0)]

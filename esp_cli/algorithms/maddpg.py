@@ -154,8 +154,7 @@ class Maddpg(ExploringLearner):
     def _value_of_policy(self, seen: Tensor, outputs: Tensor, noise: Tensor, rows: EpisodeBatch) -> Tensor:
         """Return Q where the policy acts, through which the actor's gradient flows: [S, B, T, N or 1].
 
-        Of rows the critic sees `seen` [S, B, T(, N), critic width], and the policy says `outputs` [S, B, T, N, ...], of
-        whose shape is the noise, uniform in [0, 1).
+        The critic sees `seen` [S, B, T(, N), critic width]; noise of the shape of `outputs` is uniform in [0, 1).
         """
         head, together = self.head, self.config.actor_actions == "all"
         if self.config.actor_gradient == "expected" and isinstance(head, ExploringCategorical):

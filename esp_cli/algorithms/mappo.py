@@ -78,12 +78,7 @@ class MappoConfig(LearnerConfig):
 
 
 class Mappo(Learner):
-    """The learner: policy, centralised critic, optimiser and prior of S seeds; arguments as of `Learner`.
-
-    Raises:
-        UserError: a recurrent network whose rollouts are not whole episodes, more minibatches than rows, or a critic
-            of each agent's own observation where agents end one by one and share a reward.
-    """
+    """The learner: policy, centralised critic, optimiser and prior of S seeds; arguments as of `Learner`."""
 
     config_class = MappoConfig
     config: MappoConfig

@@ -19,18 +19,12 @@ _UNKNOWN = {"mean": 0.0, "variance": 1.0, "weight": 0.0, "offset": 0.0}  # stati
 
 
 class ValueNormaliser(nn.Module):
-    """Keeps value targets near mean 0, variance 1 per seed, so that one learning rate fits every reward scale.
+    """Keeps value targets [S, ...] near mean 0, variance 1 per seed, so that one learning rate fits every reward scale.
 
-    An exponential moving average with bias correction (as for Adam's moments), after the MAPPO paper's code, which
-    uses decay 0.99999 per update: nearly an average over all of training. It moves mean and variance themselves, in
-    float64 (West, 1979): a variance as a difference of large squares is lost beside a large mean. A seed in which
-    nothing counts keeps its statistics.
-
-    Attributes:
-        offset: [S] what a learner takes off its rewards; 0 until `begin` fixes another.
-
-    Shape:
-        Every argument is [S, ...]; statistics are over all other axes.
+    An exponential moving average with bias correction (as for Adam's moments), after the MAPPO paper's code, which uses
+    decay 0.99999 per update: nearly an average over all of training. It moves mean and variance themselves, in float64
+    (West, 1979): a variance as a difference of large squares is lost beside a large mean. A seed in which nothing
+    counts keeps its statistics. A learner takes `offset` [S] off its rewards; it is 0 until `begin` fixes another.
     """
 
     def __init__(self, num_seeds: int, decay: float) -> None:
@@ -46,13 +40,8 @@ class ValueNormaliser(nn.Module):
     def begin(self, reward: Tensor, steps: float, centres: bool) -> None:
         """Before the first update, fix from the first rewards what statistics cannot tell yet; later do nothing.
 
-        Values before any is learned are what the critic outputs, or a hundredth of the sums of rewards, if these are
-        smaller than 1.
-
-        Args:
-            reward: the first ones.
-            steps: over which a target adds up rewards.
-            centres: whether a mean that is many deviations away from 0 becomes the `offset`.
+        Values before any is learned are what the critic outputs, or a hundredth of the sums of rewards over `steps`, if
+        these are smaller than 1. If it `centres`, a mean that is many deviations away from 0 becomes the `offset`.
         """
         deviation, mean = torch.std_mean(reward.double().flatten(1), 1, correction=0)
         first, offset = self.weight == 0, torch.where(mean.abs() > _FAR * deviation, mean, 0.0)

@@ -150,11 +150,7 @@ PAPER: dict[str, dict[str, Sections]] = {"mappo": {"formation": {"mappo": {"num_
 def preset_layers(task: str, algorithm: str, preset: str, network: object = None) -> list[Sections]:
     """Return the settings of a preset on a task, layer by layer; a later one has the last word.
 
-    Args:
-        task: registered name.
-        algorithm: registered name.
-        preset: "default", or another that the algorithm has.
-        network: that the user chose, None for the preset's own.
+    `network` is the user's.
     """
     presets, fast = PRESETS.get(algorithm, {"default": {}}), FAST.get(algorithm, {})
     sets = SETS.get(algorithm, {}).get(task, {})

@@ -23,10 +23,7 @@ Generators = Sequence[torch.Generator]
 
 
 def new_policy(cls: type[Learner], spec: TaskSpec, network: NetworkConfig, generators: Generators) -> Policy:
-    """Return new policies of the kind that an algorithm trains, one per generator, of each role where there are some.
-
-    The roles' weights are drawn one after the other.
-    """
+    """Return new policies of the kind that an algorithm trains, one per generator, for each role if there are some."""
     if not spec.roles:
         return cls.build_policy(spec, network, generators)
     return RolesPolicy(spec, {role.name: cls.build_policy(role, network, generators) for role in spec.roles})
@@ -35,16 +32,8 @@ def new_policy(cls: type[Learner], spec: TaskSpec, network: NetworkConfig, gener
 class RolesLearner(Learner):
     """An ordinary learner for each role, which acts in that role's view of the worlds; see `Lockstep`.
 
-    A tensor of the state is named "critic.ROLE.weight", a metric "train/ROLE/entropy".
-
-    Args:
-        cls: the algorithm.
-        env: the training worlds.
-        config: hyperparameters, the same for all roles.
-        network: likewise.
-        prior: likewise; where a role has one agent, orders of agents are left out.
-        generators: of each role, one per seed.
-        prior_generators: likewise.
+    A tensor of the state is named "critic.ROLE.weight", a metric "train/ROLE/entropy". Where a role has one agent, its
+    prior leaves orders of agents out.
     """
 
     def __init__(

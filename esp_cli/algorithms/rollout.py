@@ -165,11 +165,8 @@ def values_along(
 ) -> tuple[Tensor, Tensor]:
     """Return V(s_t) and V of what really followed, each [S, E, T, C], in the critic's units.
 
-    Args:
-        critic: the networks.
-        rollout: their inputs.
-        episode: steps of the whole episodes that a recurrent critic is unrolled over; None of one without memory.
-        terminates: whether an episode may terminate before the horizon; asking which did makes a GPU be waited for.
+    A recurrent critic is unrolled over whole episodes of `episode` steps. If none `terminates` before the horizon,
+    nothing asks which did, for which a GPU would be waited for.
     """
     if episode is not None:
         finals = [rollout.finals[t] for t in sorted(rollout.finals)]

@@ -24,10 +24,7 @@ T = TypeVar("T")
 
 
 def parse_assignments(items: Iterable[str]) -> dict[str, object]:
-    """Read settings written as "name=value"; a value that is not JSON is text.
-
-    "mappo.learning_rate=5e-4" -> {"mappo.learning_rate": 0.0005}; "prey=random" -> {"prey": "random"}.
-    """
+    """Read settings: "mappo.learning_rate=5e-4" -> {"mappo.learning_rate": 0.0005}; what is not JSON is text."""
     from esp_cli.files.documents import parse_value  # pydantic comes with it, which no help needs
 
     settings: dict[str, object] = {}

@@ -170,8 +170,7 @@ def run_cells(
 ) -> list[str]:
     """Run the cells of a study in its folder, which the caller's lock holds; return the names of those that failed.
 
-    Of cells that train the same, the first is run, and the others take its run over. `requests` is not empty once the
-    user asks to stop.
+    Of cells that train the same, one is run. `requests` is not empty once the user asks to stop.
     """
     from esp_cli.studies.scheduler import Scheduler
 

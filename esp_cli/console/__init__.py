@@ -35,10 +35,7 @@ PIPE_WIDTH = 200  # columns of a table written to a file or a pipe, which has no
 def table(
     columns: Sequence[str], rows: Iterable[Sequence[object]], title: str | None = None, caption: str | None = None
 ) -> None:
-    """Print a table on standard output, with a title above and a caption below.
-
-    A heading that ends in ">" (which is cut off) is aligned to the right; cells are printed as `str(cell)`.
-    """
+    """Print a table on standard output; a heading that ends in ">" (which is cut off) is aligned to the right."""
     target = out if out.is_terminal else SafeConsole(highlight=False, width=PIPE_WIDTH)
     laid = lay_out(columns, [[escaped(str(cell)) for cell in row] for row in rows], target)
     if title:  # outside the grid, which would wrap it to its own width

@@ -111,12 +111,7 @@ def _raw_outputs(policy: Policy, obs: Tensor, memory: Tensor) -> Tensor:
 
 
 def compare(sample: Sample, runner: Runner) -> Agreement:
-    """Compare an export with the policy.
-
-    Raises:
-        RuntimeError: they do not agree, which is a bug.
-        UserError: they cannot agree, since the rounding of the observations moves the outputs as far.
-    """
+    """Compare an export with the policy; a UserError if rounding observations moves outputs as far as they differ."""
     action, outputs, after = sample.run(runner, sample.obs)
     largest = max(1.0, float(np.abs(sample.outputs).max()))
     gap = float(np.abs(outputs - sample.outputs).max())

@@ -146,9 +146,8 @@ def global_max_pool(channels: int, places: int) -> Layer:
 def aggregate(begin: int, team: int, width: int, reach_squared: float) -> Layer:
     """Return own features x beside the neighbours' mean message: [x, mean relative position / reach, mean of their x].
 
-    The observation holds the relative positions of the others from column `begin` on, two numbers each, in team order.
-    Neighbours have a squared distance below `reach_squared`. The means divide by their number plus one, for the agent
-    itself.
+    The observation holds others' relative positions from column `begin` on, two numbers each, in team order. Neighbours
+    have a squared distance below `reach_squared`. Means divide by their number plus one, for the agent itself.
     """
     others, reach, index = team - 1, math.sqrt(reach_squared), others_of(team)
 

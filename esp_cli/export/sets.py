@@ -14,21 +14,13 @@ from esp_cli.networks.set_features import distances_among, nearest_things
 
 @dataclass(frozen=True)
 class SetOf:
-    """One set of things, and the weights that embed each of them.
-
-    Attributes:
-        name: of the set.
-        columns: of an observation, for each thing those of its numbers [K, W].
-        place: the number at which a thing's place begins; None where it has none.
-        reader: the own number at which the reader's place begins; None where it is the origin.
-        arrays: W_1 [W + distances, H] of a thing, V [own, H] of the own numbers, b_1 [H], W_2 [H, H] and b_2 [H].
-    """
+    """One set of things, and the weights that embed each of them."""
 
     name: str
-    columns: tuple[tuple[int, ...], ...]
-    place: int | None
-    reader: int | None
-    arrays: tuple[Floats, ...]
+    columns: tuple[tuple[int, ...], ...]  # of an observation, for each thing those of its numbers [K, W]
+    place: int | None  # the number at which a thing's place begins; None where it has none
+    reader: int | None  # the own number at which the reader's place begins; None where it is the origin
+    arrays: tuple[Floats, ...]  # W_1 [W + distances, H] of a thing, V [own, H] of the own numbers, b_1, W_2, b_2
 
     @property
     def width(self) -> int:
@@ -46,14 +38,9 @@ def pool_sets(
 ) -> Layer:
     """Return the own numbers, mean and maximum over each set's embedded things, and what stands beside.
 
-    Args:
-        sets: that come as tables.
-        own: W and b of a layer that embeds the own numbers; empty where they enter as they are.
-        kept: columns of the own numbers that are read.
-        inputs: own numbers of an observation.
-        beside: numbers behind them, which are passed on: the previous action.
-        near: things of each set that are read, the nearest ones; 0 for all.
-        kind: "relu" or "tanh".
+    `own` has W and b of a layer that embeds the own numbers, and is empty where they enter as they are; `kept` are the
+    columns that are read, of `inputs`. The `beside` numbers behind them are passed on: the previous action. `near`
+    things of each set are read, the nearest ones; 0 for all.
     """
     features, num_own = len(sets[0].arrays[-1]), own[1].size if own else len(kept)
     outputs = num_own + 2 * features * len(sets) + beside

@@ -18,11 +18,9 @@ from esp_cli.networks.heads import masked
 class TorchProgram(nn.Module):
     """The program in torch's own operations.
 
-    Shape:
-        observation: [rows, D]; memory: [rows, H], for recurrent policies; action_mask: [rows, A] bool, for those with
-        masks; sets: tables [rows, K, W] by name, for networks over sets.
-        Returns action ([rows] int64 or [rows, width]), outputs [rows, outputs] and, if recurrent, memory [rows, H].
-        A team's rows stand side by side, world after world.
+    It takes observation [rows, D]; of recurrent policies memory [rows, H]; of those with masks action_mask [rows, A]
+    bool; of networks over sets tables [rows, K, W] by name. It returns action ([rows] int64 or [rows, width]), outputs
+    [rows, outputs] and, if recurrent, memory [rows, H]. A team's rows stand side by side, world after world.
     """
 
     def __init__(self, program: Program) -> None:

@@ -59,12 +59,7 @@ class DocumentFormat:
     error: type[UserError] = DocumentError  # kind of exception for what the user can correct
 
     def read(self, path: str | os.PathLike[str]) -> dict[str, Any]:
-        """Return the content of a document, without ``format`` and ``version``.
-
-        Raises:
-            UserError: of the kind `error`; it is missing, too large, damaged, foreign or of a newer version.
-            OSError: the machine failed.
-        """
+        """Return the content without ``format`` and ``version``; a document that is wrong is of the kind `error`."""
         with attempting("read", path, self.error):
             text = read_regular(path, MAX_DOCUMENT_BYTES)
         if text is None:
@@ -95,12 +90,7 @@ class DocumentFormat:
             raise self.error(f"{path}: {error}") from None
 
     def write(self, path: str | os.PathLike[str], content: Mapping[str, Any]) -> None:
-        """Write a document as a whole or not at all.
-
-        Raises:
-            UserError: of the kind `error`; the content is not JSON (NaN and infinity are not), or its keys are taken.
-            OSError: the file cannot be written; what was there is as it was.
-        """
+        """Write a document as a whole or not at all; `error` says that content is no JSON (NaN) or a key taken."""
         if "format" in content or "version" in content:
             raise self.error(f"cannot write {path}: its content may not use the keys 'format' and 'version'")
         replace_file(path, encode(self.document(content), path, self.error))
@@ -178,10 +168,7 @@ def parse_object(text: bytes | str, noun: str) -> dict[str, Any]:
 
 
 def parse_value(text: str) -> Any:
-    """Parse strict JSON: no NaN, no infinity, no key twice, integers of 64 bits, nesting of at most `MAX_NESTING`.
-
-    Anything else is a ValueError.
-    """
+    """Parse strict JSON: no NaN, infinity, key twice, integer above 64 bits or nesting above `MAX_NESTING`."""
     try:
         value = json.loads(
             text, object_pairs_hook=_unique, parse_constant=_finite, parse_float=_finite, parse_int=_bounded

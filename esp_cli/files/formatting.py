@@ -86,10 +86,7 @@ def format_duration(seconds: float) -> str:
 
 
 def nearest(text: str, known: Iterable[str]) -> str | None:
-    """Return the known name that a mistyped or abbreviated name is likely to mean; None where none is near.
-
-    "learing_rate" and "lr" -> "learning_rate"; "clip" -> "clip_epsilon".
-    """
+    """Return the known name that a mistyped or abbreviated one, as "lr", is likely to mean; None if none is near."""
     names = sorted(set(known))
     close = get_close_matches(text, names, n=1)
     if close or not text:
@@ -159,9 +156,7 @@ def own_words(message: str) -> str:
 def attempting(verb: str, path: str | os.PathLike[str], kind: type[UserError]) -> Iterator[None]:
     """Turn a failure to do something ("write", "make the run folder") with a path into one sentence.
 
-    Raises:
-        kind: the user can correct it.
-        OSError: the machine failed (a full or read-only disk); it names the path.
+    It is of the kind where the user can correct it, else, of a full or read-only disk, an OSError that names the path.
     """
     try:
         yield

@@ -48,10 +48,7 @@ def replace_file(path: str | os.PathLike[str], content: bytes) -> None:
 
 
 def mend_last_line(path: Path) -> None:
-    """Remove what a kill left behind the last line break, so that the next line does not run into it.
-
-    A last line longer than any line can be is a UserError.
-    """
+    """Remove what a kill left behind the last line break, so that the next line does not run into it."""
     if not path.exists():
         return
     with os.fdopen(open_own(path, os.O_RDWR), "rb+", buffering=0) as file:
@@ -66,13 +63,10 @@ def mend_last_line(path: Path) -> None:
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Callable[[bytes], None]]:
-    """Replace a file as a whole by content that comes in parts.
+    """Replace a file as a whole by content that comes in parts, each given to the function that is yielded.
 
     The bytes go to a temporary file in the same folder, which is flushed to the disk and renamed over ``path``; then
-    the folder's own entry is flushed. A link at ``path`` is replaced, not followed.
-
-    Yields:
-        A function that takes the next part. After an exception the file is as it was before.
+    the folder's own entry is flushed. A link there is replaced, not followed. After an exception the file is as before.
     """
     path = Path(path)
     temporary = f"{TEMPORARY_PREFIX}{secrets.token_hex(8)}"

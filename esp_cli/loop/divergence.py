@@ -23,22 +23,13 @@ _KNOWN = "Categorical, OneHotCategorical, Normal, Independent, or a squashed Nor
 
 
 def policy_divergence(transform: Transform, there: Policy, here: Policy, samples: int = SAMPLES) -> Tensor:
-    """Return KL[pi(K_g . | L_g s) || pi(. | s)] for each agent (Eq. 8).
+    """Return KL[pi(K_g . | L_g s) || pi(. | s)] for each agent (Eq. 8): [..., N], or [...] without an agent axis.
 
     Exact for Categorical and OneHotCategorical; for Normal, under every rotation; for Independent ones of these; and
     for squashed Normals where the squash commutes with K_g, as tanh does with quarter turns and mirrors. Other squashed
     Normals are compared by `samples` reparametrised actions; a turned action outside of the box is clipped to it, as
     environments do. Tensors are logits of discrete actions, or continuous actions; of these it returns half the squared
-    distance, the divergence of two Normals of deviation 1.
-
-    Args:
-        transform: g, one element.
-        there: the policy at L_g s.
-        here: the policy at s.
-        samples: actions drawn where there is no closed form.
-
-    Returns:
-        [..., N], or [...] without an agent axis.
+    distance, the divergence of two Normals of deviation 1. The policy is `there` at L_g s, and `here` at s.
     """
     there, here = _bare(there), _bare(here)
     if transform.action_index is not None:

@@ -42,11 +42,8 @@ def with_copies(
 ) -> tuple[list[Any], list[Transform]]:
     """Return the data, less what is dropped, with its copies behind it, and the element of each copy.
 
-    Args:
-        spaces: what the numbers are.
-        data: TensorDict [B, ...], agents in nested groups or not, also below "next".
-        choose: returns the elements of the copies, on the device of a tensor.
-        roles: of keys by their last part, where they differ from `ROLES`.
+    The TensorDict [B, ...] has agents in nested groups or not, also below "next". `choose` returns the elements for a
+    device, and `roles` are of keys by their last part, where they differ from `ROLES`.
     """
     named: Mapping[str, Role] = {**ROLES, **(roles or {})}
     leaves = {_path(key): value for key, value in data.items(include_nested=True, leaves_only=True)}

@@ -77,10 +77,7 @@ def build_network(
     output_gain: float,
     io: IoSpec | None = None,
 ) -> Network:
-    """Build the network of the settings; `io` says what rows mean, for symmetry and the average over a group.
-
-    Further numbers may stand behind what `io` says.
-    """
+    """Build the network of the settings; `io` says what rows mean, but for further numbers that may stand behind."""
     network = config.build(generators, inputs, outputs, output_gain, io)
     if config.symmetrise is None:
         return network

@@ -210,9 +210,6 @@ class Gated(Memoryless):
 
     g begins at 0, so a begins at 0.05 everywhere and learns where, and in which features, the symmetry is broken. That
     is the idea of PEnGUiN (McClellan et al., 2025), which has such a share in every layer of a graph network.
-
-    Shape:
-        x: [S, B, in] -> [S, B, out].
     """
 
     def __init__(self, exact: Equivariant, free: SeedMLP, gate: SeedMLP, relax: float) -> None:

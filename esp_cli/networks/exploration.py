@@ -126,8 +126,8 @@ class _StraightThrough(Function):
 class BoundedPoint(ExploringHead):
     """A deterministic action: outputs squashed to the bounds. Behaviour adds Gaussian noise of deviation epsilon to it.
 
-    The noisy action goes back to the bounds. Planar vectors are bounded by the unit disc, other numbers by [-1, 1].
-    Squash, noise and bounds commute with every rotation and reflection of the action.
+    The noisy action goes back to the bounds: planar vectors to the unit disc, other numbers to [-1, 1]. Squash, noise
+    and bounds commute with every rotation and reflection of the action.
     """
 
     def __init__(self, space: Continuous, num_seeds: int) -> None:

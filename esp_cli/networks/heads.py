@@ -34,10 +34,7 @@ MASKED = -1e9  # output of an action that is not allowed: its probability is exa
 
 
 def masked(outputs: Tensor, action_mask: Tensor | None) -> Tensor:
-    """Return outputs [..., A] in which actions that the mask [..., A] forbids have the output `MASKED`.
-
-    No gradient flows to what is masked. A row that allows nothing stays as it is.
-    """
+    """Return outputs [..., A], without gradient `MASKED` where the mask forbids; a row that allows nothing stays."""
     if action_mask is None:
         return outputs
     return outputs.masked_fill(~action_mask & action_mask.any(-1, keepdim=True), MASKED)

@@ -51,8 +51,7 @@ class SharedCriticInput:
     def exchanged(self, critic: nn.Module, seen: Tensor, joint: Tensor, others: Tensor) -> Tensor:
         """Return each agent's Q [S, W, N, K] for its other actions, with the actions of all others fixed.
 
-        The critic's parameters are frozen; `seen` is what it sees of the scenes, `joint` [S, W, N, A] and `others`
-        [S, W, N, K, A] are encoded actions.
+        The critic's parameters are frozen; `joint` [S, W, N, A] and `others` [S, W, N, K, A] are encoded actions.
         """
         shape = joint.shape[1:-2]
         rows = (x.flatten(1, len(shape)) for x in (seen, joint, others))
@@ -102,10 +101,8 @@ def counterfactual_values(network: nn.Module, rows: Tensor, items: Tensor, other
     """Return the outputs for rows that end in N items, with one item at a time replaced by each of K others.
 
     The N K rows share nearly all of the first layer's sums, which are computed once. Gradients flow to `others` alone;
-    the network's own parameters have to be frozen.
-
-    Shape:
-        rows [S, R, D] before the items, items [S, R, N, A], others [S, R, N, K, A] to [S, R, N, K, outputs].
+    the network's own parameters have to be frozen. Rows [S, R, D] before the items, items [S, R, N, A], others [S, R,
+    N, K, A] give [S, R, N, K, outputs].
     """
     # normalisation changes the whole input with every exchange
     if not isinstance(network, SeedMLP) or network.norms is not None:

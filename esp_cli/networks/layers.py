@@ -51,20 +51,13 @@ class SeedLayerNorm(nn.Module):
 
 
 class SeedMLP(nn.Module):
-    """A multi-layer perceptron for S seeds.
+    """A multi-layer perceptron for S seeds of input, hidden and output `sizes`; generators draw the initial weights.
 
     Without layer normalisation forward and backward run through one hand-written function (`perceptron`) that keeps
-    only the activations and works in place; with it, through torch's own layers.
-
-    Args:
-        generators: one per seed; they draw the initial weights.
-        sizes: input width, hidden widths, output width.
-        activation: "relu" or "tanh".
-        output_gain: orthogonal gain of the last layer (0.01 for a policy head, 1 for a value).
-        layer_norm: normalise the input and every hidden activation, as the MAPPO paper's code does.
-        activate_output: end with an activation, for a body on which something else stands.
-        precision: of the matrix products; parameters, inputs, outputs and parameter gradients stay float32.
-        compiled: whether passes on the CPU go through the compiled kernel; has no effect with layer normalisation.
+    only the activations and works in place; with it, through torch's own layers. It normalises the input and every
+    hidden activation, as the MAPPO paper's code does. `output_gain` is the orthogonal gain of the last layer (0.01 for
+    a policy head, 1 for a value). `precision` is of the matrix products; parameters, inputs, outputs and parameter
+    gradients stay float32.
     """
 
     def __init__(

@@ -118,9 +118,7 @@ def distinct(rows: Tensor, keys: Tensor) -> tuple[Tensor, Tensor]:
     """Find the different rows of [S, B, D]; a batch of thousands of pictures of a torus with 49 cells has 49.
 
     Two fixed random projections, `keys` [2, D], identify a row; two different rows collide with probability 2^-46.
-
-    Returns:
-        For each seed the index of one row of each kind [S, U], padded, and the kind of each row [S, B].
+    Returned are, for each seed, the index of one row of each kind [S, U], padded, and the kind of each row [S, B].
     """
     num_seeds, batch, width = rows.shape
     flat = rows.reshape(-1, width)

@@ -44,9 +44,7 @@ def ways_to(things: Tensor, x: Tensor, at: int, reader: int | None) -> Tensor:
 class NearestFirst(Network):
     """A network that reads observations with the things of each family sorted by distance, which no turn changes.
 
-    With landmarks [3, 4] and [0, 1] it reads [0, 1] first.
-
-    Numbers that stand behind an observation stay where they are, and so does a global state.
+    With landmarks [3, 4] and [0, 1] it reads [0, 1] first. Numbers behind an observation, and a global state, stay.
     """
 
     def __init__(self, network: Network, io: IoSpec, compiled: bool) -> None:

@@ -41,10 +41,7 @@ class Shape(NamedTuple):
 def perceptron(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor]) -> Tensor:
     """Return y = W_n act(... act(x W_1 + b_1) ...) + b_n: [S, ..., out], with the axes of the inputs.
 
-    Args:
-        shape: see there.
-        inputs: [S, ..., d] parts of x, side by side; gradients flow to those that ask for them.
-        parameters: W_1, b_1, ..., W_n, b_n.
+    The inputs [S, ..., d] are parts of x, side by side; gradients flow to those that ask for them.
     """
     if torch.is_grad_enabled():
         return _Perceptron.apply(shape, len(inputs), *inputs, *parameters)  # type: ignore[no-untyped-call]
@@ -82,10 +79,7 @@ class Deferred(WithVJP):
         return self._run.backward(slope.reshape(self._run.outputs.shape))
 
     def learn(self, loss: Callable[[LearningPass], Tensor], parts: int) -> WithVJP:
-        """Return the gradients of a loss of P parts, which follow each other in the rows, as if they were a VJP's.
-
-        Outputs and slope are computed block by block and kept nowhere.
-        """
+        """Return the gradients of a loss of P parts, which follow each other in the rows, computed block by block."""
         rows = self._rows.flatten(1, -2).unflatten(1, (parts, -1)).transpose(1, 2)
         run = LearningPass(rows, self.parameters, self._shape.activation)
         return WithVJP(rows, lambda _: [loss(run)], self.parameters)

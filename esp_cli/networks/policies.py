@@ -57,10 +57,10 @@ class Policies(ABC):
 
 
 class CategoricalPolicies(Policies):
-    """Choices among A actions with probabilities softmax(outputs).
+    """Choices among A actions with probabilities softmax(outputs), actions first; see `Categorical.normalise`.
 
     A slope is by the log-probabilities [S, A, P, R], up to a multiple of the probabilities, which the softmax takes
-    away. The action axis comes first; see `Categorical.normalise`.
+    away.
     """
 
     def __init__(self, outputs: WithVJP, frame: Frame) -> None:
@@ -105,10 +105,7 @@ class CategoricalPolicies(Policies):
 
 
 class CompiledCategoricalPolicies(Policies):
-    """What `CategoricalPolicies` are, by a kernel: of copies that differ in the order of their outputs alone.
-
-    A slope is a list of what the kernel is asked to add up.
-    """
+    """`CategoricalPolicies` by a kernel, of copies that only reorder outputs; a slope lists what it is to add up."""
 
     def __init__(self, outputs: WithVJP, orders: Tensor) -> None:
         self._outputs = outputs

@@ -150,9 +150,8 @@ class HistoryPolicy(Policy):
     def unroll(self, obs: Tensor, action: Tensor, action_mask: Tensor | None = None) -> Tensor:
         """Return the normalised outputs over whole episodes, from empty memory, one row for each row of `obs`.
 
-        Shape:
-            obs [S, B, T + 1, N, D], the last row may be left out; what was done, action [S, B, T, N(, width)]; the
-            allowed actions, action_mask [S, B, T + 1, N, A] -> [S, B, T + 1, N, outputs].
+        obs [S, B, T + 1, N, D], the last row may be left out; what was done, action [S, B, T, N(, width)]; the allowed
+        actions, action_mask [S, B, T + 1, N, A] -> [S, B, T + 1, N, outputs].
         """
         rows = obs
         if self.recurrent:

@@ -15,12 +15,7 @@ from esp_envs.spec import TaskSpec
 
 
 class RolesPolicy(Policy):
-    """S policies for each role of a task; its memory and its noise are tuples, one part for each role.
-
-    Example:
-        policy = RolesPolicy(spec, {"adversary": one, "agent": other})
-        action, memory = policy.act(observation.obs, policy.initial_memory(num_envs, observation.obs))
-    """
+    """S policies for each role of a task, by name; its memory and its noise are tuples, one part for each role."""
 
     def __init__(self, spec: TaskSpec, policies: Mapping[str, Policy]) -> None:
         nn.Module.__init__(self)

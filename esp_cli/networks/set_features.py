@@ -45,22 +45,10 @@ class SetShape(CompiledConfig, ABC):
 class Rows:
     """Splits rows into the own numbers and the numbers of the things of each family, in parts that stand side by side.
 
-    Where a task does not change when it is shifted, places are taken from the middle of all places of a row.
-
-    Args:
-        layout: of a row.
-        shifts: whether the task does not change when it is shifted.
-        near: of each family the things that are nearest to the reader, to its own place where they are points; 0 for
-            all.
-        compiled: whether distances are computed by the kernel.
-
-    Attributes:
-        own: where the own numbers lie in a row; `num_own` of them are read.
-        places: of what is taken from the middle of all places.
-        offsets: for each family the number at which a thing's place begins.
-        readers: for each family where the reader's place begins in a row; None where it is the origin.
-        families: sets of like things.
-        widths: W of each family.
+    Where a task does not change when it is shifted, `places` are taken from the middle of all places of a row. `near`
+    things of each family are read, the nearest to the reader, to its own place where they are points; 0 for all. `own`
+    says where the own numbers lie, of which `num_own` are read; `offsets` for each family the number at which a thing's
+    place begins, `readers` where the reader's does, None where it is the origin, and `widths` W.
     """
 
     def __init__(self, layout: Layout, shifts: bool, near: int, compiled: bool) -> None:
@@ -118,14 +106,10 @@ def nearest_things(things: Tensor, ways: Tensor, count: int) -> Tensor:
 
 
 def distances_among(places: Sequence[Tensor]) -> list[Tensor]:
-    """Describe things by distances, which neither turns nor mirrors change.
+    """Describe the places [S, B, K, 2] of things of F families by distances, which neither turns nor mirrors change.
 
-    Args:
-        places: of the things of F families, [S, B, K, 2] each.
-
-    Returns:
-        For each family [S, B, K, 1 + F]: the distance of a thing, and that between it and the nearest other thing of
-        each family; where there is no other, twice the largest distance of any thing.
+    For each family these are [S, B, K, 1 + F]: the distance of a thing, and that between it and the nearest other thing
+    of each family; where there is no other, twice the largest distance of any thing.
     """
     described, farthest = [], 4 * torch.cat([*places], 2).square().sum(-1).amax(2, keepdim=True)
     for i, first in enumerate(places):
@@ -157,11 +141,7 @@ class Embedding(SeedMLP):
 
 
 class SetEncoder(nn.Module):
-    """Features of rows that show sets.
-
-    Attributes:
-        width: P, features of a row.
-    """
+    """Features [S, B, width] of rows that show sets."""
 
     def __init__(self, generators: Sequence[torch.Generator], rows: Rows, config: SetShape) -> None:
         super().__init__()
@@ -192,12 +172,9 @@ class SetEncoder(nn.Module):
 
 
 class TeamFeatures(nn.Module):
-    """Features of what a network reads, and of each agent in it.
+    """Features, `width` a row, of what a network reads, and of each agent in it.
 
     What reads all observations in a row embeds each as an agent's, and takes the agents as a set.
-
-    Attributes:
-        width: features of a row.
     """
 
     def __init__(

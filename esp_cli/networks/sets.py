@@ -71,10 +71,7 @@ def sets_or_refuse(name: str, io: IoSpec) -> IoSpec:
 
 
 class SetNetwork(Memoryless):
-    """Sets in, outputs of an agent, of a team or of each agent of a team out; see the module.
-
-    One value of each agent is read off that agent's features beside those of the row.
-    """
+    """Sets in, outputs of an agent, of a team or of each agent of it out, read off its and the row's features."""
 
     def __init__(
         self,

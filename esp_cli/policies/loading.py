@@ -72,10 +72,7 @@ class TrainedPolicy:
         raise UserError(f"{path} holds no checkpoint yet; train on with esp train --resume {quote(str(path))}")
 
     def transfer(self, settings: Mapping[str, object]) -> TrainedPolicy:
-        """Return the policy for its task under changed settings: another physics, more noise, another reward.
-
-        Where the network's weights are free of counts, numbers of agents and of things may change too.
-        """
+        """Return the policy for its task under changed settings, other numbers too where weights are free of counts."""
         if not settings:
             return self
         changed = resolve_task_settings(self.config.task, {**self.config.task_settings, **settings})

@@ -85,11 +85,7 @@ class Loss:
         return total
 
     def gradients(self, parameters: Sequence[Tensor]) -> list[tuple[Sequence[Tensor], list[Tensor]]]:
-        """Return parameters and the gradients by them of each seed's own loss; the same parameters may come again.
-
-        Gradients [S, ...] are those by each parameter, or one [S, P] by all side by side. `parameters` are those that
-        are learned, for what autograd takes back.
-        """
+        """Return learned parameters, maybe again, and gradients of each seed's loss by each [S, ...] or all [S, P]."""
         found: list[tuple[Sequence[Tensor], list[Tensor]]] = []
         graphs: list[Tensor] = []
         for root, slope in self._evaluate()[1]:
@@ -116,14 +112,10 @@ class Loss:
 
 
 class Values:
-    """What a critic outputs for originals and copies.
+    """What a critic outputs for originals and copies, C numbers a row.
 
-    A slope is by `rows`, or what a kernel is asked to compute together with them, where it `defers`.
-
-    Attributes:
-        count: C.
-        sizes: S, P and R = B T C.
-        defers: whether the values are not computed yet, and need not be.
+    A slope is by `rows`, or what a kernel is asked to compute together with them, where it `defers`: where the values
+    are not computed yet, and need not be. `sizes` are S, P and R = B T C.
     """
 
     def __init__(self, values: Any, frame: Frame) -> None:
@@ -175,12 +167,9 @@ def _itself(on: OfGraph, weight: float, slope: Tensor | None) -> Stated:
 
 
 def policy_consistency_loss(divergence: Callable[[Any, Any], Tensor], pulled_back: Any, original: Any) -> Tensor:
-    """Return S_pi = KL[pi(K_g . | L_g s) || pi(. | s)] (Eq. 8), [S, B, N].
+    """Return S_pi = KL[pi(K_g . | L_g s) || pi(. | s)] (Eq. 8), [S, B, N], with the divergence of a policy head.
 
-    Args:
-        divergence: KL of two distributions given by their outputs, as a policy head defines it.
-        pulled_back: outputs [S, B, N, A] of the policy at L_g s, pulled back by K_g: action a has the weight of K_g a.
-        original: outputs of the policy at s.
+    Outputs [S, B, N, A] at L_g s are `pulled_back` by K_g: action a has the weight of K_g a.
     """
     return divergence(pulled_back, original)
 

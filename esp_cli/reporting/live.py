@@ -22,11 +22,7 @@ _REFRESH_S, _FILM_PIXELS, _FILM_FRAMES_PER_SECOND = 5, 320, 12.0
 
 
 class LivePage:
-    """A tracker that draws a page into the run folder at evaluations; a browser loads it again every few seconds.
-
-    Attributes:
-        path: of the page.
-    """
+    """A tracker that draws a page into the run folder at evaluations; a browser loads it again every few seconds."""
 
     def __init__(self, trainer: Trainer) -> None:
         self._trainer, self._begun, self._spent = trainer, time.monotonic(), 0.0

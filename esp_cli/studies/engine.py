@@ -43,10 +43,7 @@ class Job(Protocol):
 
 
 class Engine(Protocol):
-    """Starts jobs. The scheduler reads their progress from the run folders.
-
-    A job that runs on another machine therefore copies what it writes into the folder here.
-    """
+    """Starts jobs. The scheduler reads their progress from the run folders, into which a job elsewhere copies it."""
 
     def places(self, device: str) -> int:
         """Return how many jobs on a device, "cpu" or "cuda", run side by side by default."""
@@ -54,18 +51,14 @@ class Engine(Protocol):
     def start(self, arguments: Sequence[str], log: Path) -> Job:
         """Start the application with these arguments of its command line; append all that it prints to the log.
 
-        Raises:
-            OSError: the machine failed.
-            UserError: the job cannot be started; the run fails, and the others go on.
+        A UserError fails this run, and the others go on; an OSError is the machine's.
         """
 
 
 class LocalEngine:
     """Starts every job in a process of its own on this machine, none of which outlives this process.
 
-    Args:
-        program: the application as a command line; it has to call `follow_parent` first.
-        folder: in which it runs; by default that of this process.
+    `program` is the application as a command line, which has to call `follow_parent` first, run in `folder`.
     """
 
     def __init__(self, program: Sequence[str] = APPLICATION, folder: Path | None = None) -> None:

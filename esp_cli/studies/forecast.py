@@ -114,7 +114,7 @@ def _added_up(title: str, out: Path, jobs: int, seconds: float, runs: Sequence[R
 def _cost(config: RunConfig, episodes: int, known: dict[str, Cost]) -> Cost:
     """Return what a run costs, measured once for those that differ in fractions alone, as in the size of a wind.
 
-    Fractions of the task are left out; of others it counts whether they are 0, which switches things off.
+    Of fractions it counts whether they are 0, which switches things off; those of the task are left out.
     """
     parts = config.model_dump(mode="json", exclude={"prior": {"weights"}}) | {"seeds": len(config.seeds)}
     parts["task_settings"] = {k: v for k, v in parts["task_settings"].items() if not isinstance(v, float)}
@@ -157,9 +157,6 @@ def measure(config: RunConfig, episodes: int) -> Cost:
 
 
 def _clock(config: RunConfig) -> Callable[[], float]:
-    """Return the processor time of this process, to which other work adds little.
-
-    Where a GPU or processes of their own for the worlds work, this one waits, and time is that of a clock on the wall.
-    """
+    """Return the processor time of this process, or where it waits for a GPU or others, a clock on the wall."""
     alone = config.device == "cpu" and not multiprocessing.active_children()
     return time.process_time if alone else time.monotonic

@@ -82,10 +82,6 @@ class RunSet(ABC):
         """Hold the folder, made if missing, so that no second process plans or works in it.
 
         Half-written documents that a killed process left are removed, those of the fresh study of a search too.
-
-        Raises:
-            StudyError: it holds something foreign.
-            LockError: another process holds it.
         """
         cls.refuse_foreign(path)
         path.mkdir(parents=True, exist_ok=True)
@@ -131,12 +127,7 @@ class RunSet(ABC):
 
     @abstractmethod
     def begin(self, cell: Cell) -> Cell:
-        """Make the run folder of a cell before its next process starts; return what the cell runs.
-
-        Raises:
-            RefusedError: it runs nothing.
-            UserError: what is there is damaged or another run.
-        """
+        """Make the run folder of a cell before its next process starts; return what it runs, or raise RefusedError."""
 
     @abstractmethod
     def goes_on(self, cell: Cell) -> bool:

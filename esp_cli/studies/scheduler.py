@@ -72,15 +72,8 @@ class Scheduler:
     def run(self, listener: Listener, poll_s: float = POLL_S) -> bool:
         """Run everything that is not finished; a run that fails is left as it is and the others go on.
 
-        Args:
-            listener: told at every look.
-            poll_s: seconds between two looks.
-
-        Returns:
-            Whether it came to its end; False where the listener asked to stop.
-
-        Raises:
-            FolderLostError: the folder of the study was moved, replaced or deleted; its processes are ended.
+        The listener is told every `poll_s` seconds; where it asks to stop, False is returned. If the folder of the
+        study was moved, replaced or deleted, its processes are ended, with a FolderLostError.
         """
         going = True
         for run in self.runs:

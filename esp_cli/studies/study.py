@@ -198,10 +198,7 @@ class StudyFolder(RunSet):
         return None
 
     def adopt(self, cell: Cell, twin: Path) -> None:
-        """Take a finished run of the same configuration over as this cell's; its log says where it is from.
-
-        Links in its folder are left out: they would bring in files from anywhere.
-        """
+        """Take a finished run over as this cell's, without links, which bring in files from anywhere; its log tells."""
         part = self.path / self.runs / f".{cell.name}.part"
         require_held(part)
         shutil.rmtree(part, ignore_errors=True)  # what a kill left

@@ -145,12 +145,7 @@ class Trials(StudyFolder):
 
 
 class Benchmark:
-    """What is asked for: the methods that each task takes, and why the others are left out.
-
-    Attributes:
-        taken: names of task and method, in the order of the tables.
-        left_out: by "TASK: METHOD" why the task does not take the method.
-    """
+    """What is asked for: the methods that each task takes, and by "TASK: METHOD" why others are left out."""
 
     title = "Trials of the benchmark of symmetry"
 
@@ -250,10 +245,7 @@ class Benchmark:
         return self._study("symmetry-trials", self.title, tuple(cells))
 
     def judged(self, trials: Trials) -> Study:
-        """Plan the runs that judge, with the settings of each method's best trial, the first of equal ones.
-
-        `trials.json` in the folder holds the draws and the scores.
-        """
+        """Plan the runs that judge, with each method's best trial, the first of equals; `trials.json` has scores."""
         cells, scores, size = [], dict[str, list[float | None]](), self.budget
         of_trials = [score(trials.run_path(cell)) for cell in self.trials.cells]
         for k, (name, method) in enumerate(self.taken):

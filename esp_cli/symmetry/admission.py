@@ -41,17 +41,10 @@ def admitted_elements(text: str, spaces: Spaces, instead: str = "") -> tuple[Ele
 
 
 def admit(text: str, elements: Sequence[Element] | Group, spaces: Spaces, instead: str = "") -> None:
-    """Refuse transforms that a task cannot carry.
+    """Refuse transforms that a task cannot carry; `text` is what the user wrote, and `instead` what to do.
 
-    Args:
-        text: what the user wrote, for the message.
-        elements: what it means.
-        spaces: of the task.
-        instead: what to do where the task carries no planar group; by default to use orders of agents or no prior.
-
-    Raises:
-        UserError: some action's image is no action, the element is outside the task's declared symmetry, or agents
-            or items are to change places and a layout does not say which numbers follow them.
+    It cannot where some action's image is no action, the element is outside the task's declared symmetry, or agents or
+    items are to change places and a layout does not say which numbers follow them.
     """
     moved = elements.generators() if isinstance(elements, Group) else tuple(elements)
     reason = _reason(_require, moved, spaces)
@@ -86,12 +79,9 @@ def default_transforms(spaces: Spaces, weighed: bool = False) -> str:
     """Return the transforms of a task for which nobody chose any, as `parse_elements` takes them.
 
     d4 where the task carries it; else the planar part of its symmetry if that can be listed; else c4; else orders of
-    its agents or items. Where it declares nothing, d4, which `admit` refuses.
-
-    Args:
-        spaces: of the task.
-        weighed: whether each element counts by how nearly it holds, so that nothing has to be declared: then d4
-            wherever actions and layouts carry it, and such orders, or elements coupled with some, beside it.
+    its agents or items. Where it declares nothing, d4, which `admit` refuses. Where each element is `weighed` by how
+    nearly it holds, nothing has to be declared: then d4 wherever actions and layouts carry it, and such orders, or
+    elements coupled with some, beside it.
     """
     if isinstance(spaces, TaskSpec) and spaces.roles:
         own = [default_transforms(role, weighed) for role in spaces.roles]
@@ -157,9 +147,9 @@ def unrestricted(spaces: Spaces) -> Spaces:
 
 
 def under_a_compass(spaces: Spaces) -> Spaces:
-    """Return spaces whose agents see a compass and labels.
+    """Return spaces whose agents see a compass and labels: they admit all that moves the scene, and orders of agents.
 
-    They admit whatever moves the scene, every order of agents, and the orders of items declared before.
+    Orders of items are admitted as declared before.
     """
     items = [group.name for group in _declared(_usable(spaces), spaces.num_agents) if rank(group)[0] == 2]
     return replace(spaces, nearly="*".join([_ANY_SCENE, AGENTS, *items]))

@@ -14,14 +14,8 @@ class Frame:
     """The originals' frame: what is returned for a copy is pulled back by the transform that made the copy.
 
     There a copy is learned from as its original is: it has the original's action and target (Prop. 1), and its policy
-    and value compare with those of the original (Eq. 8, 9).
-
-    Args:
-        transforms: K, with which copies were made that follow the B originals along the batch axis.
-
-    Attributes:
-        parts: 1 + K.
-        moves_agents: whether any exchanges agents.
+    and value compare with those of the original (Eq. 8, 9). The K copies follow the B originals along the batch axis;
+    `parts` is 1 + K, and `moves_agents` says whether any exchanges agents.
     """
 
     def __init__(self, transforms: Sequence[Transform]) -> None:
@@ -38,10 +32,7 @@ class Frame:
         return self._each(outputs, lambda g: g.push_outputs).flatten(1, 2)
 
     def pull_items(self, item: Tensor, outputs: Tensor) -> Tensor | None:
-        """Return where the items of outputs stand: for each number of `pull_outputs` the item that it is at its copy.
-
-        `item` [W] is that of each number of an action. None where no element exchanges items.
-        """
+        """Return for each number of `pull_outputs` its copy's item, from `item` [W] of actions; None if none moves."""
         if not any(element.items for g in self._transforms for element in g.elements):
             return None
         parts = self._parts(item.to(outputs.dtype).expand_as(outputs))

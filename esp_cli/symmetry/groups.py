@@ -45,13 +45,9 @@ class Group(ABC):
 
 
 class FiniteGroup(Group):
-    """A listed group, sorted by `Element.sort_key`: identity first.
+    """A listed group of G elements, sorted by `Element.sort_key`: identity first.
 
-    FiniteGroup.generated_by("d2", [rotation(180), mirror()]).order  # 4
-
-    Attributes:
-        name: what `parse_elements` calls it.
-        elements: all G elements.
+    FiniteGroup.generated_by("d2", [rotation(180), mirror()]).order # 4
     """
 
     def __init__(self, name: str, elements: Iterable[Element]) -> None:

@@ -32,17 +32,10 @@ _ORDER = r"(?!(?i:rot|flip|agents)-)([A-Za-z]\w*)((?:-\d{1,4})+)"
 def parse_elements(text: str, num_agents: int) -> tuple[Element, ...] | Group:
     """Read a comma-separated list of elements and groups.
 
-    Args:
-        text: elements (`rot90`, `flip-x`, `flip22.5`, `agents-1-0-2`, `landmarks-1-0-2`) and groups (`c4`, `d4`,
-            `so2`, `o2`, `agents`, `landmarks-3`), each possibly a product with `*`, whose right factor acts first.
-        num_agents: N, which gives `agents` its meaning.
-
-    Returns:
-        The non-identity elements in the order written, each once; or the group itself where it has to be sampled
-        (continuous, or larger than `LISTED_LIMIT`).
-
-    Raises:
-        UserError: an unknown name, nothing besides the identity, or a sampled group that does not stand alone.
+    Elements are as `rot90`, `flip-x`, `flip22.5`, `agents-1-0-2`, `landmarks-1-0-2`, groups as `c4`, `d4`, `so2`, `o2`,
+    `agents`, `landmarks-3`, each possibly a product with `*`, whose right factor acts first. Returned are the
+    non-identity elements in the order written, each once; or the group itself where it has to be sampled (continuous,
+    or larger than `LISTED_LIMIT`), which has to stand alone.
     """
     items = [_item(part.strip(), text, num_agents) for part in text.split(",")]
     listed = [item for item in items if isinstance(item, tuple)]
@@ -60,8 +53,7 @@ def parse_elements(text: str, num_agents: int) -> tuple[Element, ...] | Group:
 def parse_group(text: str, num_agents: int) -> Group:
     """Read a declared symmetry: groups, and elements as generators, `d4*agents` or `flip-x*hips-3-2-1-0`.
 
-    Factors that act on different things make up their direct product. A comma, or factors that act on a common thing,
-    stand for all that they generate together.
+    Factors that act on different things make their direct product; a comma, or a common thing, all that they generate.
     """
     return direct_product(*declared_factors(text, num_agents))
 

@@ -131,10 +131,9 @@ def output_operator(spaces: Spaces, elements: Sequence[Element]) -> Operator:
 
 
 def action_map(action: Discrete, elements: Sequence[Element]) -> Indices:
-    """Return K_g of a discrete action space [G, A]: entry [g, j] is the action that j becomes.
+    """Return K_g of a discrete action space [G, A]: entry [g, j] is the action that means what j means, turned.
 
-    It is derived by turning each action's physical meaning and looking for the action that means the result. Of
-    several actions with one meaning the first goes to the first, the second to the second.
+    Of several actions with one meaning the first goes to the first, the second to the second.
     """
     points = np.array(action.points, dtype=np.float64)
     images = np.einsum("gvw,jw->gjv", item_operator(Field("action", action.kind), elements).matrix, points)

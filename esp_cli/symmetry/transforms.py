@@ -196,10 +196,7 @@ def sorted_anew(rows: Tensor, layout: Layout) -> Tensor:
 class TransformSet:
     """The transforms that a learner may use, and the draw of one: listed elements, or a group that is sampled.
 
-    Attributes:
-        names: the elements' names; the group's name alone where it is sampled.
-        is_finite: whether the elements are listed, see `parse_elements`.
-        size: how many elements are listed, the identity not counted; 0 where the group is sampled.
+    A sampled group has the `names` of the group alone, and the `size` 0; else that is without the identity.
     """
 
     def __init__(
@@ -223,12 +220,9 @@ class TransformSet:
         """Draw one element per seed, uniformly among those that are not the identity.
 
         The identity is left out because a copy of the batch that equals the batch adds nothing. Each seed draws from
-        its own generator, so seed k draws the same alone and among ten.
-
-        Args:
-            generators: one per seed, on the CPU.
-            keep: by listed element (one number for a sampled group) how likely it is beside the others, 0 to 1. With
-                probability 1 - max(keep) the identity takes the place of the drawn one. Empty: all alike, and all stay.
+        its own generator on the CPU, so seed k draws the same alone and among ten. `keep` has by listed element (one
+        number for a sampled group) how likely it is beside the others, 0 to 1; with probability 1 - max(keep) the
+        identity takes the place of the drawn one. Empty: all alike, and all stay.
         """
         if self._group is None:
             return self._picked([self._pick(keep, g) for g in generators])

@@ -172,11 +172,7 @@ class PolicyController:
 
 
 class ScriptedController:
-    """A policy of the task itself, such as its random one or a heuristic, as a function of the environment.
-
-    Example:
-        >>> play(env, ScriptedController(methodcaller("heuristic"))).returns
-    """
+    """A policy of the task itself, random or a heuristic, as a function of its worlds: methodcaller("heuristic")."""
 
     def __init__(self, choose: Callable[[Environment], Tensor]) -> None:
         self._choose = choose

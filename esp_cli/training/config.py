@@ -146,18 +146,10 @@ def resolve_config(
 ) -> RunConfig:
     """Resolve a preset and overrides into a full configuration.
 
-    Args:
-        task: registered name.
-        algorithm: registered name.
-        preset: one of the algorithm's: "default" takes what measured best on the task, where that is known, "fast"
-            what reaches the same return in fewer seconds.
-        steps: environment steps per seed.
-        seeds: of the run.
-        device: "cpu" or "cuda".
-        overrides: dotted names to values, such as "mappo.learning_rate"; text is read as JSON where that is possible.
-
-    Where the task carries no transform and nobody chose a setting of the prior, there is none.
-    An unknown name or a value out of range is a UserError.
+    The preset "default" takes what measured best on the task, where that is known, "fast" what reaches the same return
+    in fewer seconds. Steps are environment steps per seed. Overrides are by dotted names, such as
+    "mappo.learning_rate"; text is read as JSON where that is possible. Where the task carries no transform and nobody
+    chose a setting of the prior, there is none. An unknown name or a value out of range is a UserError.
     """
     sections = _preset_sections(task, algorithm, preset, (overrides or {}).get("network.name"))
     _override(sections, overrides or {}, task, algorithm)

@@ -110,10 +110,9 @@ def truncate_metrics(path: str | os.PathLike[str], last_step: int) -> None:
 
 
 def column(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the steps [K] and values [K, S] of one metric in the rows of a run.
+    """Return the steps [K] and values [K, S] of one metric in the rows of a run, or raise NoMetricError.
 
-    Rows without it are left out, ``null`` is NaN, a bare number is a value of one seed. Where no row has the metric,
-    that is a NoMetricError.
+    Rows without it are left out, ``null`` is NaN, a bare number is a value of one seed.
     """
     found = [(row["step"], row[name]) for row in rows if name in row]
     if not found:

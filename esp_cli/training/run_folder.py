@@ -67,12 +67,9 @@ def read_run_config(path: Path) -> tuple[dict[str, Any], str | None]:
 
 
 class RunFolder:
-    """A folder that holds one run; use :meth:`create` or :meth:`open`.
+    """A folder that holds one run, made by :meth:`create` or :meth:`open` with its resolved configuration.
 
-    Attributes:
-        path: the folder; `metrics_path`, `policy_path`, `initial_path` and `lock_path` are files in it.
-        config: the resolved configuration that the run was made with.
-        identity: of the run, drawn when it was made; None of a run of esp 0.1.
+    Its identity was drawn when it was made; it is None of a run of esp 0.1.
     """
 
     def __init__(self, path: Path, config: dict[str, Any], identity: str | None = None) -> None:

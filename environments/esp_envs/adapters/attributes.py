@@ -102,10 +102,7 @@ def _outcome(copy: Copy, env: Any, action: Mapping[Any, Any]) -> Array:
 
 
 def simulated_layout(copy: Copy, parts: Sequence[tuple[TaskSpec, slice]], declared: Layout | None) -> Layout | None:
-    """Return the layout of the state of a known simulator, None where a check cannot put it into one.
-
-    `parts` are the roles, and where their agents stand.
-    """
+    """Return the layout of the state of a known simulator, of roles at slices; None where no check can set it."""
     seen = copy.seen(copy.start(0)[0])
     size = copy.take().size
     found = declared or copy.simulator.layout

@@ -55,8 +55,8 @@ def _kind(env: Any, wanted: str) -> str:
 class ByAgent:
     """A Gymnasium environment as a PettingZoo `ParallelEnv`, as far as the adapter needs one.
 
-    Its agents are entries of Tuple spaces and of lists, as in level-based foraging: "agent_0", "agent_1" and so on. One
-    that is `alone` is called "agent".
+    Agents are entries of Tuple spaces and lists, as in level-based foraging: "agent_0" and so on; one `alone` is
+    "agent".
     """
 
     def __init__(self, env: Any, alone: bool = True) -> None:
@@ -151,8 +151,7 @@ def ends(
 ) -> tuple[set[Any], set[Any]]:
     """Return who has terminated in or before this step, and who was truncated.
 
-    An agent's own flag goes before the one of `EVERYONE`. An agent that is not in `env.agents` has left: without a flag
-    it has terminated.
+    An agent's own flag goes before that of `EVERYONE`. One that left `env.agents` without a flag has terminated.
     """
     over = {name for name in agents if _is_set(terminated, name)}
     cut = {name for name in agents if _is_set(truncated, name)} - over

@@ -21,12 +21,7 @@ Path = tuple[tuple[bool, Any], ...]
 
 
 class Attributes:
-    """Numbers inside of an environment that are those of a layout.
-
-    Args:
-        layout: what they are.
-        places: for each number, where it stands: the paths of parts, and its index in each.
-    """
+    """Numbers inside of an environment that are those of a layout: of each, paths of parts and its index in them."""
 
     def __init__(self, layout: Layout, places: Sequence[Sequence[tuple[Path, int]]]) -> None:
         self.layout, self._places = layout, places

@@ -51,10 +51,7 @@ def within(offset: Array, unit_m: float) -> Array:
 
 
 def step_reward(settings: FormationSettings, progress: Array, apart: Array) -> Array:
-    """Return g_i + c_i [W, N] of robots that came nearer to their goals by `progress` [W, N] m.
-
-    `apart` [W, N, N + M] are the distances of the centres to all robots and pillars, m.
-    """
+    """Return g_i + c_i [W, N] for `progress` [W, N] m; `apart` [W, N, N + M] m are to centres of robots and pillars."""
     near = apart < settings.radius
     count = near.any(-1) if settings.penalty_counts == "any" else near.sum(-1)
     return settings.progress_weight * progress - settings.penalty * count
@@ -74,10 +71,8 @@ def towards(wish: Array, heading: Array, control_period_s: float) -> Array:
 def give_way(to_goal: Array, to_bodies: Array, gaps: Array) -> Array:
     """Return the way [W, N, 2] that keeps clear of near bodies: away from them, and past them on the right.
 
-    Args:
-        to_goal: [W, N, 2] m.
-        to_bodies: [W, N, B, 2] from each robot's centre to the centre of every other body, m.
-        gaps: [W, N, B] between their surfaces, m; infinite for a robot and itself.
+    `to_bodies` [W, N, B, 2] leads to the centre of every other body, m; `gaps` [W, N, B] are between surfaces, m, and
+    infinite for a robot and itself.
     """
     near = np.maximum(1 - np.maximum(gaps, 0) / SIGHT_M, 0)
     away = -to_bodies / np.maximum(length(to_bodies), 1e-9)[..., None]

@@ -39,10 +39,10 @@ def is_installed(backend: str) -> bool:
 
 
 def forget_missing_backend() -> None:
-    """Take MUJOCO_GL out of the environment where the library that it names is missing.
+    """Take MUJOCO_GL out of the environment where the library that it names is missing, before MuJoCo is imported.
 
-    `import mujoco` would otherwise fail with "'NoneType' object has no attribute 'glGetError'", even for training,
-    which draws nothing. To be called before MuJoCo is imported.
+    Its import fails otherwise ("'NoneType' object has no attribute 'glGetError'"), even for training, which draws
+    nothing.
     """
     named = os.environ.get("MUJOCO_GL", "").strip().lower()
     known = _OF_SYSTEM.get(sys.platform, ())
@@ -54,12 +54,7 @@ def forget_missing_backend() -> None:
 
 @contextmanager
 def open_painter(size: int) -> Iterator[Painter]:
-    """Open a painter of scenes in space, `size` pixels wide; MuJoCo is imported when it is opened.
-
-    Raises:
-        NoGraphicsError: MuJoCo is not installed, or no library here can draw.
-        UserError: the size is below 16 pixels.
-    """
+    """Open a painter of scenes in space, `size` pixels wide, 16 or more; MuJoCo is imported when it is opened."""
     forget_missing_backend()
     try:
         from esp_envs.epuck.view import SpacePainter  # noqa: PLC0415
@@ -74,11 +69,7 @@ def open_painter(size: int) -> Iterator[Painter]:
 
 
 def choose_library() -> None:
-    """Let `mujoco.Renderer` draw with the first library that can.
-
-    Raises:
-        NoGraphicsError: none can.
-    """
+    """Let `mujoco.Renderer` draw with the first library that can; NoGraphicsError where none can."""
     wished = os.environ.get("MUJOCO_GL", os.environ.get("PYOPENGL_PLATFORM", "")).strip().lower()
     reasons: list[str] = []
     for backend in sorted(_LIBRARIES, key=lambda name: name != wished):

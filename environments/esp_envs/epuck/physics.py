@@ -33,12 +33,8 @@ class Physics(ABC):
     def place(self, pose: Array, velocity: Array, pillars: Array, mass: Array, friction: Array) -> None:
         """Put every world into a state; what follows depends on nothing before.
 
-        Args:
-            pose: [W, N, 3] x, y (m) and heading (rad, counter-clockwise from the x axis).
-            velocity: [W, N, 3] of x, y (m/s) and heading (rad/s).
-            pillars: [W, M, 2] x, y (m).
-            mass: [W, N], a multiple of an e-puck's.
-            friction: likewise.
+        pose [W, N, 3]: x, y (m) and heading (rad, counter-clockwise from the x axis). velocity [W, N, 3]: m/s and
+        rad/s. pillars [W, M, 2]: m. mass and friction [W, N]: multiples of an e-puck's.
         """
 
     @abstractmethod

@@ -45,15 +45,10 @@ def drive(wheels: Array) -> tuple[Array, Array]:
 
 
 def chord(wheels: Array, heading: Array, duration_s: float) -> Array:
-    """Return the constant velocity (vx, vy, spin), [..., 3], that ends where the arc of these wheels would.
+    """Return the constant velocity (vx, vy, spin), [..., 3], that ends where the arc of wheels [..., 2] (rad/s) would.
 
     A robot that drives at speed v and turns at rate w follows an arc; over a time T its end is reached as well along
     the chord: in the direction heading + w T / 2, at the speed v sin(w T / 2) / (w T / 2).
-
-    Args:
-        wheels: [..., 2] left and right wheel speed, rad/s.
-        heading: [...] at the beginning, rad.
-        duration_s: T.
     """
     speed, spin = drive(wheels)
     half_turn = spin * duration_s / 2
@@ -95,10 +90,7 @@ class Arena:
         return self.side_m / 2 - BODY_RADIUS_M - POST_CLEARANCE_M
 
     def posts(self) -> Array:
-        """Return where the robots start, evenly spread along a square: eight stand on corners and edge midpoints.
-
-        They are [N, 2], counter-clockwise from the lower left corner, m. A robot's goal is the antipode of its post.
-        """
+        """Return where robots start [N, 2], counter-clockwise from lower left on a square, m; goals are antipodes."""
         along = np.arange(self.num_robots) * 4 / self.num_robots
         corner = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])
         edge = along.astype(int)

@@ -90,10 +90,7 @@ class Camera:
 
 
 class SpacePainter:
-    """Draws scenes whose bodies say what they are models of; `esp_envs.epuck.gl.open_painter` makes one.
-
-    A picture is `size` pixels wide, 16 or more, and three quarters as high; `camera` is where the last was taken from.
-    """
+    """Draws scenes whose bodies say what they are models of, `size` pixels wide and 3/4 as high; see `open_painter`."""
 
     camera: Camera
     note: str | None = None

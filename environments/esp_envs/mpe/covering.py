@@ -45,8 +45,7 @@ def one_each(position: Tensor, landmark: Tensor) -> Tensor:
 def assigned(position: Tensor, landmark: Tensor) -> Tensor:
     """Give each agent a landmark of its own so that the sum of distances is least (Hungarian method); see `one_each`.
 
-    With more than `MOST_ASSIGNED` of them an agent takes the nearest landmark that no nearer agent wants, round after
-    round.
+    Beyond `MOST_ASSIGNED` an agent takes the nearest landmark that no nearer agent wants, round after round.
     """
     from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 - few need it, and it takes long to import
 

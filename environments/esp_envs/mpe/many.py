@@ -17,16 +17,10 @@ _NO_PUSH = 60 * CONTACT_MARGIN  # gap between two rims from which on a push is 0
 class ManyWorlds(ParticleWorlds):
     """W worlds in which all agents push each other apart; arguments as of `ParticleWorlds`, without lists of pairs.
 
-    Args:
-        sees: of the others in the crowd and of the landmarks, how many nearest ones each of the crowd sees; 0 for all.
-        crowd: how many agents, the first ones, see each other.
-        solid: whether landmarks push agents away.
-
-    Attributes:
-        touching: [A, W'] other agents that touch each agent.
-        squared_to_landmarks: [L, W'] from each landmark to its nearest agent.
-        seen_agents: [W, crowd, k] index of the nearest others, the nearest first; None where all are seen.
-        seen_landmarks: [W, crowd, k] likewise.
+    Each of the `crowd` first agents sees as many nearest others of the crowd, and landmarks, as `sees` says; 0 for all.
+    `touching` [A, W'] counts the agents that touch each, `squared_to_landmarks` [L, W'] is from each landmark to its
+    nearest agent, and `seen_agents` and `seen_landmarks` [W, crowd, k] are indices, the nearest first; None where all
+    are seen.
     """
 
     def __init__(

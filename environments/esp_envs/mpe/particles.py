@@ -39,23 +39,14 @@ _SMALLEST_SQUARED_DISTANCE = 1e-24
 
 @dataclass(frozen=True)
 class Bodies:
-    """What the bodies of a world are.
+    """What the bodies of a world are."""
 
-    Attributes:
-        radius: one per entity, agents first and landmarks after them, in lengths.
-        gain: one per agent, acceleration of a full control (MPE's `sensitivity` or `accel`), length / s^2.
-        max_speed: one per agent in length / s, or None where speed is not limited.
-        contacts: pairs (a, b) of entities that push each other apart; a is an agent.
-        watched: further pairs (a, b) whose distance the task wants to know; they exert no force.
-        extent: one per entity, half the side of the square in which it starts, lengths; empty where the task says.
-    """
-
-    radius: tuple[float, ...]
-    gain: tuple[float, ...]
-    max_speed: tuple[float, ...] | None
-    contacts: tuple[tuple[int, int], ...]
-    watched: tuple[tuple[int, int], ...] = ()
-    extent: tuple[float, ...] = ()
+    radius: tuple[float, ...]  # one per entity, agents first and landmarks after them, in lengths
+    gain: tuple[float, ...]  # of each agent, acceleration of full control (MPE's `sensitivity`, `accel`), length / s^2
+    max_speed: tuple[float, ...] | None  # one per agent in length / s, or None where speed is not limited
+    contacts: tuple[tuple[int, int], ...]  # pairs (a, b) of entities that push each other apart; a is an agent
+    watched: tuple[tuple[int, int], ...] = ()  # further pairs whose distance the task wants to know
+    extent: tuple[float, ...] = ()  # half the side of the square in which each entity starts, lengths
 
     @property
     def num_agents(self) -> int:
@@ -123,10 +114,9 @@ class ParticleWorlds:
     def advance(self, control: Tensor, push: Tensor | None = None, mud: float = 0.0) -> None:
         """Advance all worlds by DT_S.
 
-        Args:
-            control: [A, 2, W'] wish of each agent in units of its gain, normally of length <= 1.
-            push: acceleration [A, 2, W' or 1] that nobody wishes for, length / s^2.
-            mud: share of the velocity that a step costs more where x > 0.
+        Controls [A, 2, W'] are in units of an agent's gain, normally of length <= 1. `push` [A, 2, W' or 1] is an
+        acceleration that nobody wishes for, length / s^2, and `mud` the share of velocity that a step costs more where
+        x > 0.
         """
         held = 1 - mud * (self.position[:, :1] > 0).float() if mud else None
         contact = self._contact_impulses()
@@ -169,11 +159,7 @@ def contact_strength(squared_distance: Tensor, touching: Tensor) -> Tensor:
 
 
 def exact_matmul(left: Tensor, right: Tensor, out: Tensor | None = None) -> Tensor:
-    """Multiply float32 matrices in full float32, even where PyTorch was told to round matrix products.
-
-    A learner may have switched on TF32, bfloat16 products or autocast for its networks; physics and observations must
-    not be rounded by that, so the product is then taken in float64.
-    """
+    """Multiply float32 matrices exactly, in float64 where a learner switched on TF32, bfloat16 products or autocast."""
     if _products_are_rounded(left.device.type):
         product = (left.double() @ right.double()).float()
         return product if out is None else out.copy_(product)

@@ -96,12 +96,7 @@ class Slope(NamedTuple):
 
 
 class CompiledChoices:
-    """Softmax of outputs [S, P R, A] of P parts, each reordered to the originals' actions.
-
-    Args:
-        outputs: of the network, in any layout.
-        orders: [S, P, A] int64, which output of a part is the original's action.
-    """
+    """Softmax of outputs [S, P R, A] of P parts, reordered to the originals' actions by int64 orders [S, P, A]."""
 
     def __init__(self, outputs: Tensor, orders: Tensor) -> None:
         self._outputs, self._orders = outputs, orders.contiguous()

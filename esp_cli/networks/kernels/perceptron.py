@@ -79,14 +79,7 @@ def _counted(shape: torch.Size, steps: tuple[int, ...]) -> tuple[tuple[int, ...]
 
 
 class _Plan:
-    """What does not change from pass to pass of a network whose inputs lie alike.
-
-    Args:
-        inputs: how they lie.
-        parameters: where they begin, and how they lie.
-        activate_output: see `Shape`.
-        others: "tanh", "threads" and "things" of `_Perceptron`.
-    """
+    """What does not change from pass to pass of a network whose inputs and parameters lie alike; see `_Perceptron`."""
 
     def __init__(
         self, inputs: Sequence[Lies], parameters: Sequence[tuple[int, Lies]], activate_output: bool, **others: int
@@ -214,10 +207,8 @@ class CompiledPass:
 class LearningPass(CompiledPass):
     """A pass whose outputs a kernel turns into the slope of a loss at once, block by block; they are kept nowhere.
 
-    Args:
-        rows: [S, R, parts, in], the parts of a row stay together.
-        parameters: of a perceptron that does not end with an activation.
-        activation: of its hidden layers.
+    The rows are [S, R, parts, in], of which the parts of a row stay together; the perceptron ends without an
+    activation.
     """
 
     computes_again = True

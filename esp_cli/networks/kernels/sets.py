@@ -27,13 +27,9 @@ def compiled_distances(places: Sequence[Tensor]) -> list[Tensor]:
 
 
 def sort_things(rows: Tensor, columns: Tensor, at: int, reader: int | None) -> None:
-    """Sort the things of a set by distance in rows [B, D] on the CPU, in place.
+    """Sort the things of a set in contiguous rows [B, D] on the CPU, in place, by distance from the column `reader`.
 
-    Args:
-        rows: contiguous.
-        columns: where each thing's numbers are, [K, W].
-        at: the number of a thing with which its place begins.
-        reader: the column of the place from which distances are; None for the origin.
+    Each thing's numbers are in `columns` [K, W], and its place begins with the number `at`. None stands for the origin.
     """
     own = -1 if reader is None else reader
     call(
@@ -48,11 +44,8 @@ def sort_things(rows: Tensor, columns: Tensor, at: int, reader: int | None) -> N
 class _PooledPass(CompiledPass):
     """A pass of things [S, B, K, .] whose outputs are mean and maximum over each set, [S, B, 2H].
 
-    To compute what layers give to many things costs less than to keep it.
-
-    Attributes:
-        each: what the perceptron gives of each thing [S, B, K, H], where that is asked for.
-        by_each: the gradient by that, which its owner may fill in before `backward_to`.
+    To compute what layers give to many things costs less than to keep it; `each` has it [S, B, K, H], where asked for.
+    Its owner may fill in the gradient by that, `by_each`, before `backward_to`.
     """
 
     computes_again = True
@@ -104,10 +97,9 @@ class _Pooled(torch.autograd.Function):
 def compiled_pool(
     parts: Sequence[Tensor], parameters: Sequence[Tensor], activation: str, each: bool
 ) -> tuple[Tensor, Tensor | None]:
-    """Pass the things of sets [S, B, K, .] through a perceptron that ends with an activation.
+    """Pass things of sets [S, B, K, .] through a perceptron that ends with an activation.
 
-    Returns:
-        Mean and maximum over each set [S, B, 2H], and what the perceptron gives of each thing [S, B, K, H] where asked.
+    Returned are mean and maximum over each set [S, B, 2H], and what it gives of each thing [S, B, K, H] where asked.
     """
     if torch.is_grad_enabled():
         return _Pooled.apply(activation, each, len(parts), *parts, *parameters)  # type: ignore[no-untyped-call]
