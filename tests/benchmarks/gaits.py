@@ -1,7 +1,8 @@
 """Does the prior make legged robots learn faster, and walk alike to both sides? Tuned alike, five seeds by default.
 
-    python tests/benchmarks/gaits.py --out runs/gaits [--tasks ant humanoid quadruped] [--steps 2M] [--budget 12]
-                                     [--seeds 5] [--json gaits.json] [--plot gaits.png]
+    python tests/benchmarks/gaits.py --out runs/gaits [--tasks ant humanoid quadruped]
+                                     [--steps 2M ant=500k] [--budget 12] [--seeds 5] [--jobs 2]
+                                     [--json gaits.json] [--plot gaits.png]
 
 For each task `esp tune --prior esp,none` searches settings for both on equal steps, and trains the best beside the
 default ones on seeds of their own. After any kill, the same command goes on. The gait's left-right difference is that
@@ -86,17 +87,21 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--tasks", nargs="+", default=["ant", "humanoid", "quadruped"])
-    parser.add_argument("--steps", default="2M")
+    parser.add_argument("--steps", nargs="+", default=["2M"], help="per seed of all tasks, and of one, as ant=500k")
     parser.add_argument("--budget", default="12")
     parser.add_argument("--seeds", default="5")
+    parser.add_argument("--jobs", default="1", help="runs side by side")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--plot", type=Path)
     parser.add_argument("--set", action="append", default=[])
     chosen = parser.parse_args()
     found: dict[str, dict[str, dict]] = {}
+    of_task = dict(one.split("=") for one in chosen.steps if "=" in one)
+    of_all = next((one for one in chosen.steps if "=" not in one), "2M")
     for task in chosen.tasks:
-        words = ["--task", task, "--algo", "mappo", "--prior", "esp,none", "--steps", chosen.steps]
-        words += ["--budget", chosen.budget, "--seeds", chosen.seeds, "--out", str(chosen.out / task)]
+        words = ["--task", task, "--algo", "mappo", "--prior", "esp,none", "--steps", of_task.get(task, of_all)]
+        words += ["--budget", chosen.budget, "--seeds", chosen.seeds, "--jobs", chosen.jobs]
+        words += ["--out", str(chosen.out / task)]
         words += [word for one in chosen.set for word in ("--set", one)]
         subprocess.run([sys.executable, "-m", "esp_cli", "tune", *words], check=True)
         found[task] = {path.name: measured(path) for path in sorted((chosen.out / task / "fresh" / "runs").iterdir())}
