@@ -133,7 +133,12 @@ class Learner(ABC):
         """Collect, learn, and return what came out; `progress` is the share of the run that is done, 0 to 1."""
 
     def iteration(self, metrics: dict[str, Tensor], *watched: Tensor) -> Iteration:
-        """Return metrics with the flags that say in which seeds all the watched numbers, [S] each, are finite."""
+        """Return metrics with the flags that say in which seeds all the watched numbers, [S] each, are finite.
+
+        The prior learns of "train/return", if it is there.
+        """
+        if (returns := metrics.get("train/return")) is not None:
+            self.prior.learned(returns)
         seeds = torch.ones(len(self.generators["learner"]), device=self.device)
         return Iteration(metrics, torch.stack([seeds, *watched]).isfinite().all(0))
 
@@ -151,6 +156,7 @@ class Learner(ABC):
             out |= {f"optimiser.{name}.{key}": value for key, value in optimiser.state_dict().items()}
         for name, generators in self.generators.items():
             out[f"generators.{name}"] = generator_states(generators)
+        out |= {f"prior.{key}": value for key, value in self.prior.state_dict().items()}
         return out | {f"collector.{key}": value for key, value in self.collector.state_dict().items()}
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
@@ -166,6 +172,7 @@ class Learner(ABC):
                 optimiser.load_state_dict(below(tensors, f"optimiser.{name}"))
             for name, generators in self.generators.items():
                 restore_generators(generators, tensors[f"generators.{name}"])
+            self.prior.load_state_dict(below(tensors, "prior"))
             self.collector.load_state_dict(below(tensors, "collector"))
         except (KeyError, RuntimeError, IndexError, TypeError, ValueError) as error:
             reason = str(error).split("\n")[0]

@@ -31,8 +31,10 @@ class PriorConfig(Strict):
         "d4",
         description="elements, a group, or discovered; paper: rot90; ours: best on navigation; on own tasks: declared",
     )
-    copies: Literal["draw", "all"] = Field(
-        "draw", description="draw one element per minibatch, or add one copy per element to every minibatch"
+    copies: Literal["draw", "all", "bandit"] = Field(
+        "draw",
+        description="draw one element per minibatch; add one copy per element to all; or, for each iteration, the "
+        "element or none that training returns were highest after (AdaptAUG)",
     )
     consistency_coef: float = Field(0.1, ge=0, description="c of Eq. 10; paper: 0.5")
     old_log_prob: Literal["copy", "recompute"] = Field(
@@ -84,8 +86,8 @@ class PriorConfig(Strict):
 
     @property
     def needs_declaration(self) -> bool:
-        """Whether a task has to declare the elements: not where each is weighed, or a compass keeps copies true."""
-        return self.trust == "full" and not self.compass
+        """Whether a task has to declare the elements: not where each is weighed or tried, nor under a compass."""
+        return self.trust == "full" and self.copies != "bandit" and not self.compass
 
     def effective(self) -> PriorConfig:
         """Return this prior with every setting that has no effect set to its default.

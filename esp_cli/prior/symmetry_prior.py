@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, TypedDict
 import torch
 from torch import Tensor
 
+from esp_cli.prior.bandit import Bandit
 from esp_cli.prior.copies import Copies
 from esp_cli.prior.seed_batch import Rows
 from esp_cli.symmetry import Transform, transform_set
@@ -49,11 +50,15 @@ class SymmetryPrior:
         if not config.needs_declaration:
             admitting = under_a_compass(spaces) if config.compass else unrestricted(spaces)
         self.transforms = transform_set(config.transforms, admitting, device) if active else None
-        if self.transforms is not None and config.copies == "all" and not self.transforms.is_finite:
-            raise UserError(f"prior.copies=all needs a finite group, but '{config.transforms}' is infinite; use draw")
+        if self.transforms is not None and config.copies != "draw" and not self.transforms.is_finite:
+            told = f"prior.copies={config.copies} needs a finite group, but '{config.transforms}' is infinite"
+            raise UserError(f"{told}; use draw")
+        if config.copies == "bandit" and (config.trust != "full" or config.fade or config.compass):
+            raise UserError("prior.copies=bandit finds what helps by itself; leave prior.trust, fade and compass out")
         self._probe = _probe(spaces, device)
         self.strength = 1.0
         self._weights = self._weigh()
+        self._bandit: Bandit | None = None
 
     def begin(self, progress: float) -> None:
         """Set how strong the prior is from here on: 1 - progress / fade, or 1 where it does not fade.
@@ -64,6 +69,23 @@ class SymmetryPrior:
         proportion, in expectation.
         """
         self.strength = max(0.0, 1.0 - progress / self.config.fade) if self.config.fade else 1.0
+
+    def learned(self, returns: Tensor) -> None:
+        """End an iteration whose episodes had these mean training returns, [S]; a bandit chooses by them."""
+        if self.config.copies == "bandit" and self.transforms is not None:
+            self._bandit = self._bandit or Bandit(len(returns), self.transforms.size + 1)
+            self._bandit.step(returns.cpu())
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return what a resumed run needs, beside the generators."""
+        return self._bandit.state_dict() if self._bandit else {}
+
+    def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
+        """Restore what `state_dict` returned."""
+        if tensors and self.transforms is not None:
+            self._bandit = Bandit(len(tensors["arm"]), self.transforms.size + 1)
+            for name, value in self._bandit.state_dict().items():
+                value.copy_(tensors[name])
 
     def _weigh(self) -> list[float]:
         names = self.transforms.names if self.transforms is not None else ()
@@ -93,7 +115,10 @@ class SymmetryPrior:
         """Return the share of the rows in a learner's own loss that are copies, [S]."""
         keep = self._keep()
         kept = max(keep, default=0.0) if self._draws_one else sum(keep) / max(1, len(keep))
-        return torch.full((num_seeds,), kept) * self.num_copies / (1 + self.num_copies) * self.config.augments
+        used = torch.full((num_seeds,), kept)
+        if self._bandit:
+            used = (self._bandit.arm < self._bandit.num_arms - 1).float()
+        return used * self.num_copies / (1 + self.num_copies) * self.config.augments
 
     @property
     def recomputes(self) -> bool:
@@ -136,6 +161,8 @@ class SymmetryPrior:
         keep = self._keep()
         if self.transforms is None or not any(keep):
             return []
+        if self.config.copies == "bandit":
+            return [self.transforms.chosen(self._bandit.arm.tolist() if self._bandit else [0] * len(generators))]
         if all(share == 1 for share in keep):
             return [self.transforms.draw(generators)] if self._draws_one else self.transforms.each()
         if self._draws_one:

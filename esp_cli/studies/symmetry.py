@@ -37,6 +37,7 @@ METHODS: Mapping[str, Settings] = {
     "plain": _PLAIN,
     "ESP": _ESP,
     "copies": {**_ESP, "prior.kind": "augment"},
+    "copies by a bandit": {**_ESP, "prior.kind": "augment", "prior.copies": "bandit"},
     "consistency": {**_ESP, "prior.kind": "consistency"},
     "ESP and orders of agents": {**_ESP, "prior.transforms": "d4*agents"},
     "sets": _SETS,

@@ -225,7 +225,7 @@ class TransformSet:
         identity takes the place of the drawn one. Empty: all alike, and all stay.
         """
         if self._group is None:
-            return self._picked([self._pick(keep, g) for g in generators])
+            return self.chosen([self._pick(keep, g) for g in generators])
         elements = []
         for generator in generators:
             while (element := self._group.draw(generator)).is_identity:
@@ -244,9 +244,10 @@ class TransformSet:
 
     def kept(self, index: int, strength: float, generators: Sequence[torch.Generator]) -> Transform:
         """Return one of the listed elements, for each seed with probability `strength`, else the identity."""
-        return self._picked([index if _stays(strength, g) else self.size for g in generators])
+        return self.chosen([index if _stays(strength, g) else self.size for g in generators])
 
-    def _picked(self, picks: Sequence[int]) -> Transform:
+    def chosen(self, picks: Sequence[int]) -> Transform:
+        """Return the listed element of each seed by its index; `size` stands for the identity."""
         if self._stack is None:
             elements = (*self._elements, Element())
             return self._build([elements[i] for i in picks])
