@@ -1,4 +1,4 @@
-"""`esp export`: write a trained policy in other formats, or add it to the bundled policies."""
+"""`esp export`: write a trained policy in other formats."""
 
 from __future__ import annotations
 
@@ -14,24 +14,19 @@ from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
     from esp_cli.export.export import Exported
-    from esp_cli.policies.bundled import Entry
     from esp_cli.policies.loading import TrainedPolicy
 
 EPILOG = """Examples:\n
     esp export formation -f c -o formation-c\n
-    esp export runs/cn-mappo -f onnx -f numpy -o cn-export\n
-    esp export runs/cn-mappo -f policy -o checkpoints"""
+    esp export runs/cn-mappo -f onnx -f numpy -o cn-export"""
 
-FORMATS = ("onnx", "torch", "c", "numpy", "policy")
+FORMATS = ("onnx", "torch", "c", "numpy")
 
 
 def export(
     policy: options.PolicyArgument,
     formats: Annotated[
-        list[str],
-        typer.Option(
-            "--format", "-f", help=f"What to write: {', '.join(FORMATS[:-1])}; repeatable. Or policy: bundle it."
-        ),
+        list[str], typer.Option("--format", "-f", help=f"What to write: {', '.join(FORMATS)}; repeatable.")
     ],
     out: options.OutOption,
     task: options.OwnTaskOption = None,
@@ -44,16 +39,8 @@ def export(
     episodes: Annotated[
         int | None,
         typer.Option(
-            "--episodes",
-            "-e",
-            min=2,
-            max=1_000_000,
-            help="Per seed, to find the best; as many others evaluate a bundled policy.",
-            show_default=str(EPISODES),
+            "--episodes", "-e", min=2, max=1_000_000, help="Per seed, to find the best.", show_default=str(EPISODES)
         ),
-    ] = None,
-    name: Annotated[
-        str | None, typer.Option("--name", help="Name of a bundled policy; by default TASK-ALGO-PRIOR.")
     ] = None,
     force: options.ForceOption = False,
     json: options.JsonOption = None,
@@ -63,19 +50,17 @@ def export(
     Every export has the layout and the units of its observation, the meaning of its actions, and a worked example.
     If the agents of a task have roles, each role's policy gets a folder.
     """
-    _check_options(formats, seed, episodes, name)
+    for unknown in set(formats) - set(FORMATS):
+        raise UserError(f"there is no format '{unknown}'; the formats are {', '.join(FORMATS)}")
+    if seed is not None and episodes is not None:
+        raise UserError("--episodes finds the best seed, and --seed names one; leave one of them out")
     from esp_cli.export.export import export as write
-    from esp_cli.policies.bundling import bundle
     from esp_cli.policies.loading import open_policy
 
     options.register_named(task, [algo], network)
     trained = open_policy(policy, algo, prior)
     for text in trained.notes:
         console.note(text)
-    if formats == ["policy"]:
-        entry = bundle(trained, out, episodes or EPISODES, seed, name, force)
-        console.result(json, entry, lambda: _announce(entry, out))
-        return
     chosen = _best(trained, episodes or EPISODES) if seed is None else seed
     if not trained.spec.roles:
         exported = write(trained.single_seed(chosen), formats, out, force)
@@ -93,28 +78,8 @@ def export(
     console.result(json, each, show)
 
 
-def _check_options(formats: list[str], seed: int | None, episodes: int | None, name: str | None) -> None:
-    for unknown in set(formats) - set(FORMATS):
-        raise UserError(f"there is no format '{unknown}'; the formats are {', '.join(FORMATS)}")
-    bundles = "policy" in formats
-    if bundles and len(formats) > 1:
-        raise UserError("-f policy bundles a policy; leave out the other formats, or export them in a second command")
-    if name is not None and not bundles:
-        raise UserError("--name is for -f policy alone; leave it out")
-    if seed is not None and episodes is not None and not bundles:
-        raise UserError("--episodes finds the best seed, and --seed names one; leave one of them out")
-
-
-def _announce(entry: Entry, out: Path) -> None:
-    low, high = entry.score.ci95
-    console.note(
-        f"{entry.name}: seed {entry.seed} of {entry.chosen_from}, return {entry.score.mean:.2f} "
-        f"[{low:.2f}, {high:.2f}] over {entry.score.episodes} episodes -> {out / entry.file}"
-    )
-
-
 def _best(trained: TrainedPolicy, episodes: int) -> int:
-    from esp_cli.policies.bundling import best_seed
+    from esp_cli.policies.evaluation import best_seed
 
     seeds = trained.config.seeds
     best = best_seed(trained, episodes)

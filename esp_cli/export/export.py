@@ -103,7 +103,7 @@ FORMATS = {
     "c": Format(_c, lambda folder, program: c_file.c_runner(folder / "policy.c", program)),
     "numpy": Format(_numpy, lambda folder, _: numpy_runner(folder / "policy.py")),
 }
-"""The formats by name; `esp export` lists them without importing them, and -f policy beside them."""
+"""The formats by name; `esp export` lists them without importing them."""
 
 
 def export(trained: TrainedPolicy, formats: Sequence[str], folder: Path, force: bool = False) -> Exported:

@@ -89,12 +89,6 @@ def read_bundled(folder: Path | None = None) -> tuple[Entry, ...]:
     return entries
 
 
-def write_bundled(folder: Path, entries: tuple[Entry, ...]) -> None:
-    """Write a manifest, sorted by name."""
-    listed = [entry.model_dump(mode="json") for entry in sorted(entries, key=lambda entry: entry.name)]
-    MANIFEST_FORMAT.write(folder / MANIFEST, {"policies": listed})
-
-
 def find(name: str, algo: str | None = None, prior: str | None = None) -> Entry:
     """Find a bundled policy by its name, or by its task, algorithm and kind of prior ("none": the plain learner).
 

@@ -103,6 +103,16 @@ def evaluate(trained: TrainedPolicy, episodes: int) -> FinalEvaluation:
     )
 
 
+def best_seed(trained: TrainedPolicy, episodes: int) -> int:
+    """Return the seed with the largest mean greedy return over episodes that no evaluation uses."""
+    if len(trained.config.seeds) == 1:
+        return trained.config.seeds[0]
+    returns = play_batches(trained.config, PolicyController(trained.policy), "selection", episodes).returns.mean(1)
+    if len(trained.stopped) < len(returns):
+        returns[list(trained.stopped)] = -torch.inf
+    return trained.config.seeds[int(returns.argmax())]
+
+
 def play_references(config: RunConfig, names: Sequence[str], episodes: int) -> dict[str, Episodes]:
     """Play the random policy and the task's heuristics: "random", "heuristic" for the first, others by name."""
     anchors = {"random": play_batches(config, ScriptedController(methodcaller("random_action")), "random", episodes)}

@@ -42,23 +42,15 @@ def test_without_a_compiler_the_source_is_written_and_said_to_be_unchecked(
     assert "Not compared with the policy" in (tmp_path / "README.md").read_text()
 
 
-def test_a_policy_goes_into_a_folder_and_is_used_from_there(
-    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = tmp_path / "checkpoints"
-    result = esp("export", finished, "-f", "policy", "-o", folder, "--episodes", 4)
-    (entry,) = read_bundled(folder)
-    assert f"{entry.name}: seed {entry.seed} of 2" in result.stderr
-    monkeypatch.setattr("esp_cli.policies.bundled.bundled_folder", lambda: folder)
-    judged = json.loads(esp("eval", "navigation", "--episodes", 4, "--json", "-").stdout)
-    assert judged["greedy"]["mean"] == pytest.approx(entry.score.mean)
-    assert entry.name in esp("policies", "navigation").stdout
+def test_a_bundled_policy_is_used_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (entry,) = (e for e in read_bundled() if e.name == "navigation-mappo-esp")
     esp("render", entry.name, "-o", tmp_path / "n.png")
     assert (tmp_path / "n.png").stat().st_size
-    said = refused("eval", "navigation", "--algo", "qmix")
-    assert "no policy fits navigation --algo qmix; the bundled policies are navigation-mappo-esp" in said
-    assert "has no policy of formation" in refused("policies", "formation")
-    (folder / MANIFEST).write_text("{")
+    said = refused("eval", "navigation", "--algo", "ppo")
+    assert "no policy fits navigation --algo ppo; the bundled policies are navigation-" in said
+    assert "has no policy of mine" in refused("policies", "mine")
+    monkeypatch.setattr("esp_cli.policies.bundled.bundled_folder", lambda: tmp_path)
+    (tmp_path / MANIFEST).write_text("{")
     assert "is not valid JSON" in refused("eval", "navigation")
 
 
@@ -73,9 +65,7 @@ def test_the_folder_that_comes_along_is_listed() -> None:
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (["-f", "tflite"], "there is no format 'tflite'; the formats are onnx, torch, c, numpy, policy"),
-        (["-f", "policy", "-f", "c"], "-f policy bundles a policy; leave out the other formats"),
-        (["-f", "c", "--name", "mine"], "--name is for -f policy alone"),
+        (["-f", "tflite"], "there is no format 'tflite'; the formats are onnx, torch, c, numpy"),
         (["-f", "c", "--seed", "4"], "has no seed 4; it has 3, 7"),
         (["-f", "c", "--algo", "mappo"], "--algo and --prior choose among a task's policies"),
         ([], "Missing option '--format'"),
@@ -106,14 +96,6 @@ def test_no_file_of_another_policy_stays_beside_an_export(finished: Path, tmp_pa
     assert "holds an export with other formats; write them anew too (-f torch)" in refused(*other)
     esp(*other, "-f", "torch")
     assert json.loads((tmp_path / "policy.json").read_text())["formats"] == ["numpy", "torch"]
-
-
-def test_a_bundled_policy_is_replaced_only_by_force(finished: Path, tmp_path: Path) -> None:
-    bundle = ("export", finished, "-f", "policy", "-o", tmp_path, "--episodes", 4)
-    esp(*bundle, "--seed", 3)
-    assert "has navigation-mappo-esp already; choose another --name, or replace it with --force" in refused(*bundle)
-    esp(*bundle, "--seed", 7, "--force")
-    assert [entry.seed for entry in read_bundled(tmp_path)] == [7]
 
 
 def test_episodes_that_choose_nothing_are_refused(finished: Path, tmp_path: Path) -> None:

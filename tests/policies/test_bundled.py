@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import runpy
 import shlex
 import shutil
 import threading
@@ -16,17 +17,17 @@ import pytest
 from esp_cli.commands.counts import parse_count, parse_seeds
 from esp_cli.commands.options import parse_assignments
 from esp_cli.files.opening import taking_turns
-from esp_cli.policies import bundled, bundling
+from esp_cli.policies import bundled
 from esp_cli.policies.bundled import MANIFEST, Entry, bundled_folder, find, read_bundled, standard_name
-from esp_cli.policies.bundling import best_seed, bundle
-from esp_cli.policies.evaluation import FinalEvaluation, evaluate, play_batches
-from esp_cli.policies.loading import TrainedPolicy, load_entry, open_policy
+from esp_cli.policies.evaluation import best_seed, evaluate, play_batches
+from esp_cli.policies.loading import load_entry, open_policy
 from esp_cli.policies.statistics import mean_and_sem, normalised
 from esp_cli.training.build import PolicyController
 from esp_cli.training.config import RunConfig, resolve_config, resolve_task_settings
 from tests.export.policies import drawn_policy
 
 ENTRIES = read_bundled()
+bundle = runpy.run_path(str(Path(__file__).parents[2] / "docs" / "bundle_policy.py"))["bundle"]
 EPISODES = {"formation": 8}
 """Episodes to judge a policy anew by, where fewer than 128 will do: they are long, and all alike."""
 
@@ -99,9 +100,9 @@ def test_the_box_is_beside_the_packages_or_in_the_wheel(tmp_path: Path, monkeypa
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Drawn policies in a manifest: two of navigation, one with a name of its own, and one by another algorithm."""
     folder = tmp_path_factory.mktemp("bundled")
-    bundle(drawn_policy("choice", seeds=(3, 7)), folder, 4)
-    bundle(drawn_policy("exploring choice, recurrent"), folder, 4)
-    bundle(drawn_policy("vector"), folder, 4, name="navigation-vectors")
+    for policy, name in (("exploring choice, recurrent", "maddpg-esp"), ("vector", "vectors")):
+        bundle(drawn_policy(policy), f"navigation-{name}", folder, 4)
+    bundle(drawn_policy("choice", seeds=(3, 7)), "navigation-mappo-esp", folder, 4)
     return folder
 
 
@@ -123,14 +124,11 @@ def test_what_is_put_in_is_found_and_plays_the_same(small: Path) -> None:
     assert entry.normalised == pytest.approx(float(normalised(entry.score.mean, found.anchors)))
 
 
-def test_the_seed_is_the_one_that_did_best(small: Path) -> None:
+def test_the_seed_is_the_one_that_did_best(tmp_path: Path) -> None:
     trained = drawn_policy("choice", seeds=(3, 7))
     best = best_seed(trained, 64)
-    with_seed = {seed: bundle(trained, small, 64, seed, f"seed-{seed}").score.mean for seed in (3, 7)}
-    assert best == max(with_seed, key=with_seed.__getitem__)
-    for seed in (3, 7):
-        (small / f"seed-{seed}.safetensors").unlink()
-    bundled.write_bundled(small, tuple(e for e in read_bundled(small) if not e.name.startswith("seed")))
+    with_seed = {seed: evaluate(trained.single_seed(seed), 64).greedy.mean for seed in (3, 7)}
+    assert best == max(with_seed, key=with_seed.__getitem__) == bundle(trained, "best", tmp_path, 64).seed
 
 
 def test_a_seed_that_stopped_is_not_the_best_unless_all_did() -> None:
@@ -179,36 +177,10 @@ def test_a_folder_of_the_name_goes_before_the_box(small: Path, tmp_path: Path, m
 
 
 def test_an_entry_of_the_same_name_is_replaced(tmp_path: Path) -> None:
-    first = bundle(drawn_policy("choice"), tmp_path, 4)
-    second = bundle(drawn_policy("choice", hidden=(5,)), tmp_path, 4, force=True)
+    first = bundle(drawn_policy("choice"), "own", tmp_path, 4)
+    second = bundle(drawn_policy("choice", hidden=(5,)), "own", tmp_path, 4)
     assert first.sha256 != second.sha256
     assert read_bundled(tmp_path) == (second,)
-    with pytest.raises(ValueError, match=r"'Best one!' is not a valid policy name"):
-        bundle(drawn_policy("choice"), tmp_path, 4, name="Best one!")
-
-
-def test_files_of_others_are_left_alone(tmp_path: Path) -> None:
-    mine = tmp_path / "thesis.safetensors"
-    mine.write_text("mine")
-    with pytest.raises(ValueError, match=r"has thesis already; choose another --name, or replace it with --force"):
-        bundle(drawn_policy("choice"), tmp_path, 4, name="thesis")
-    (tmp_path / "config.json").write_text("{}")
-    for force in (False, True):
-        with pytest.raises(ValueError, match=r"is the folder of a run, .*; choose another --out"):
-            bundle(drawn_policy("choice"), tmp_path, 4, name="policy", force=force)
-    assert mine.read_text() == "mine"
-    assert {file.name for file in tmp_path.iterdir()} == {"thesis.safetensors", "config.json"}
-
-
-def test_a_policy_that_another_export_adds_meanwhile_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def meanwhile(trained: TrainedPolicy, episodes: int) -> FinalEvaluation:
-        monkeypatch.setattr(bundling, "evaluate", evaluate)
-        bundle(drawn_policy("vector"), tmp_path, 4, name="other")
-        return evaluate(trained, episodes)
-
-    monkeypatch.setattr(bundling, "evaluate", meanwhile)
-    bundle(drawn_policy("choice"), tmp_path, 4, name="own")
-    assert [entry.name for entry in read_bundled(tmp_path)] == ["other", "own"]
 
 
 @pytest.fixture
