@@ -14,7 +14,6 @@ class Breaks:
     Attributes:
         plane: the planar group that is left, the name of the settings' attribute that says it, or None where nothing of
             the plane is broken.
-        agents: whether the agents may still be exchanged.
 
     Example:
         class WindySettings(TaskSettings):
@@ -22,7 +21,6 @@ class Breaks:
     """
 
     plane: str | None
-    agents: bool = True
 
 
 class TaskSettings(BaseModel):
@@ -56,8 +54,7 @@ class TaskSettings(BaseModel):
         plane, *rest = whole.split("*")
         if planes:
             plane = planes.pop() if len(planes) == 1 else "c1"
-        exchanged = all(one.agents for one in broken)
-        return "*".join((plane, *(factor for factor in rest if factor != "agents" or exchanged)))
+        return "*".join((plane, *rest))
 
     def broken_in_words(self) -> str:
         """Return what a reward convention adds about the settings that break a symmetry: ", wind 0.3"."""

@@ -70,7 +70,6 @@ class Learner(ABC):
         config_class: model of its hyperparameters.
         task_settings: what it asks of a task that has such settings, where a user says nothing else.
         replays: whether it has a replay, in which the prior may store copies.
-        has_policy_term: whether it has a policy whose outputs S_pi can compare; one of action values alone has none.
         config: hyperparameters.
         spec: of the task.
         device: where everything is.
@@ -85,7 +84,6 @@ class Learner(ABC):
     config_class: ClassVar[type[LearnerConfig]] = LearnerConfig
     task_settings: ClassVar[Mapping[str, object]] = MappingProxyType({})
     replays: ClassVar[bool] = False
-    has_policy_term: ClassVar[bool] = True
     config: LearnerConfig
     policy: Policy
     modules: dict[str, nn.Module]

@@ -51,7 +51,6 @@ class Qmix(ExploringLearner):
     """The learner: utilities, mixer, their targets, optimiser and prior of S seeds; arguments as of `Learner`."""
 
     config_class = QmixConfig
-    has_policy_term = False
     watched = ("td_loss", "grad_norm")
     config: QmixConfig
     task_settings = MappingProxyType({"actions": "discrete"})

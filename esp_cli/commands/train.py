@@ -46,9 +46,6 @@ def train(
         ),
     ] = None,
     transforms: options.TransformsOption = None,
-    consistency_coef: Annotated[
-        float | None, typer.Option("--consistency-coef", min=0.0, help="c, the weight of the consistency loss.")
-    ] = None,
     physics: options.PhysicsOption = None,
     network: Annotated[
         str | None,
@@ -121,7 +118,6 @@ def train(
     short = {
         "prior.kind": prior,
         "prior.transforms": transforms,
-        "prior.consistency_coef": consistency_coef,
         "network.name": network,
         "task.physics": physics,
     }

@@ -23,12 +23,6 @@ TOLERANCE = 1e-5  # largest difference of an observation's number; float32 in me
 _WORLDS = 100
 _JITTER_M = 0.001  # noise on the task's positions: in a perfect square two robots are equally near
 _EXACT = {"sensor_noise_m": 0.0, "heading_noise_rad": 0.0}  # of a robot's sensors in training, which poses do not show
-_UNSEEN = ("heading_offset_rad", "blind_sector_rad")  # settings of what a robot sees that are not built from poses
-
-
-def builds_observations(settings: Mapping[str, object]) -> bool:
-    """Return whether what a robot sees is built from poses under these settings of its task."""
-    return not any(settings[name] for name in _UNSEEN)
 
 
 def seen_robots(settings: Mapping[str, Any]) -> int:

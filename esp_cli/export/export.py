@@ -127,7 +127,7 @@ def _job(trained: TrainedPolicy, formats: Sequence[str]) -> Job:
     sample = take_sample(trained, program)
     description = describe(trained, program, sample)
     drives = "numpy" in formats and not program.memory_width
-    robotic = drives and "robot" in description and epuck.builds_observations(trained.spec.settings)
+    robotic = drives and "robot" in description
     return Job(trained, program, sample, description, epuck.take_scenes(trained) if robotic else None)
 
 

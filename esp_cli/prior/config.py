@@ -40,9 +40,6 @@ class PriorConfig(Strict):
     old_log_prob: Literal["copy", "recompute"] = Field(
         "copy", description="pi_old of a copied transition: copied from the original, or recomputed on the copy (Eq. 7)"
     )
-    terms: Literal["both", "policy", "value"] = Field(
-        "both", description="consistency terms: S_pi and S_V (S_Q of an action-value critic), or one of them"
-    )
     replay: Literal["sampled", "stored"] = Field(
         "sampled",
         description="off-policy learners: copies are made of drawn batches, or stored in the replay (paper: stored)",
@@ -123,7 +120,7 @@ def of_no_use_to(kind: str) -> frozenset[str]:
     """Return the names of settings that change nothing in a prior of this kind."""
     unused = {
         "none": frozenset(PriorConfig.model_fields),
-        "augment": frozenset({"consistency_coef", "terms"}),
+        "augment": frozenset({"consistency_coef"}),
         "consistency": frozenset({"old_log_prob", "replay"}),
     }
     return unused.get(kind, frozenset())

@@ -109,17 +109,15 @@ class Copies(Generic[Rows]):
         return self._made[id(tensor)]
 
     def penalty(self, policy: tuple[Any, Any] | None = None, value: Any = None) -> Loss:
-        """Return c times the sum of the consistency terms that are on (Eq. 10), or nothing where the loss is off.
+        """Return c times the sum of the consistency terms (Eq. 10), or nothing where the loss is off.
 
         Args:
             policy: a head and its outputs for all rows [S, B (1 + copies), ..., N, A]; None leaves S_pi out.
             value: values of all rows [S, B (1 + copies), ..., C]; None leaves S_V (S_Q) out.
         """
-        coefficient, terms = self.config.coefficient, self.config.terms
-        if not self.transforms or coefficient == 0:
+        if not self.transforms or self.config.coefficient == 0:
             return Loss()
-        gaps = self._gaps(policy if terms != "value" else None, value if terms != "policy" else None)
-        return coefficient * Loss(*(term for gap in gaps.values() for term in gap.terms))
+        return self.config.coefficient * Loss(*(t for gap in self._gaps(policy, value).values() for t in gap.terms))
 
     def gaps(self, policy: tuple[Any, Any] | None = None, value: Any = None) -> dict[str, Tensor]:
         """Return S_pi (Eq. 8) under "policy" and S_V (Eq. 9) or S_Q (supplement eq. 19) under "value".

@@ -79,7 +79,6 @@ class RunConfig(Strict):
         """Return settings that change nothing beside the others, as "prior.weights"."""
         learner = ALGORITHMS[self.algorithm]
         of_others = {"old_log_prob" if learner.replays else "replay"}
-        of_others |= set() if learner.has_policy_term else {"terms"}
         settings = learner.config_class(**self.algorithm_settings)
         task = task_class(self.task).Settings(**self.task_settings)
         idle = {
@@ -163,11 +162,6 @@ def resolve_config(
             changes = {"kind": "none"}
         prior = prior.model_copy(update=changes)
     learner = ALGORITHMS[algorithm]
-    if prior.terms == "policy" and prior.coefficient > 0 and not learner.has_policy_term:
-        raise UserError(
-            f"prior.terms=policy leaves {algorithm} without a consistency loss, since it learns values and has no "
-            "policy to compare; use prior.terms=value, or both"
-        )
     name = sections["network"].get("name", "mlp")
     network = validated(network_class(name), sections["network"], "network", f"the network {name}")
     values = {

@@ -138,7 +138,7 @@ EVERYTHING = [
     {"task": "predator-prey", "task__control": "prey"},
     {"task__num_agents": 1, "algo__td_lambda": 0.5},
     {"algo__bootstrap_truncated": True, "algo__critic_sees_time": False},
-    {"prior__terms": "value", "network__layer_norm": True},
+    {"network__layer_norm": True},
 ]
 CONTINUOUS = [
     {"task__actions": "continuous", "prior__transforms": "o2"},

@@ -2,7 +2,7 @@
 
 import torch
 
-from tests.algorithms.off_policy import after, equal, learner
+from tests.algorithms.off_policy import learner
 
 
 class Sum(torch.nn.Module):
@@ -61,11 +61,3 @@ def test_target_networks_are_copied_every_so_many_steps():
         assert torch.equal(start, trained.target_policy.actor.layers[0].weight) is (k < 3)
     assert torch.equal(trained.policy.actor.layers[0].weight, trained.target_policy.actor.layers[0].weight)
     assert torch.equal(trained.mixer.hypernetwork.layers[0].weight, trained.target_mixer.hypernetwork.layers[0].weight)
-
-
-def test_the_consistency_loss_is_that_of_the_values_whatever_terms_are_chosen():
-    both, value, none = (
-        after("qmix", **prior)[0] for prior in ({}, {"prior__terms": "value"}, {"prior__kind": "none"})
-    )
-    assert equal(both, value)
-    assert not equal(both, none)

@@ -33,14 +33,12 @@ from tests.cli.running import esp, refused
 
 FORCES = {"actions": "continuous"}
 ROBOTS = {"horizon": 40, "num_agents": 4, "num_obstacles": 2}
-NOTHING = {"wind": 0.3, "gust_mean": 1.0, "weak_agent": 0.5, "num_agents": 2, "num_landmarks": 1}
+NOTHING = {"wind": 0.3, "action_turn_rad": 0.5, "num_agents": 1, "num_landmarks": 1}
 DRONES = {"width": 5, "height": 5, "horizon": 30}
 FOUND = [
     ("navigation", {}, "d4*agents*landmarks-3"),
     ("navigation", FORCES, "o2*agents*landmarks-3"),
     ("navigation", {"wind": 0.3, **FORCES}, "flip-x*agents*landmarks-3"),
-    ("navigation", {"gust_mean": 1.0, "gust_std": 1.0}, "flip-diagonal*agents*landmarks-3"),
-    ("navigation", {"weak_agent": 0.5}, "d4*landmarks-3 and agents-0-2-1"),
     ("navigation", NOTHING, "c1"),
     ("predator-prey", {}, "d4*agents*obstacles-2"),
     ("predator-prey", {"control": "prey", **FORCES}, "d4*obstacles-2"),

@@ -34,7 +34,7 @@ def test_every_option_reaches_the_configuration(tmp_path: Path) -> None:
     run = train_tiny(
         tmp_path / "deep" / "run",
         *("--algo", "mappo", "--task", "predator-prey", "--prior", "consistency", "--transforms", "rot90,flip-x"),
-        *("--consistency-coef", "0.25", "--network", "gru", "--seed-list", "3,7", "--device", "cpu"),
+        *("--set", "prior.consistency_coef=0.25", "--network", "gru", "--seed-list", "3,7", "--device", "cpu"),
         *("--set", "mappo.learning_rate=5e-4", "--set", "task.prey=fleeing"),
         steps="0.05k",
     )
@@ -100,10 +100,10 @@ def test_a_return_has_its_normalised_score_beside_it(tmp_path: Path) -> None:
     [
         (["--prior", "none", "--set", "prior.transforms=c4"], "prior.transforms"),
         (["--set", 'prior.weights={"rot90":0.5}', "--set", "prior.doubt=2"], "prior.doubt, prior.weights"),
-        (["--prior", "consistency", "--consistency-coef", "0", "--transforms", "c4"], "prior.transforms"),
+        (["--prior", "consistency", "--set", "prior.consistency_coef=0", "--transforms", "c4"], "prior.transforms"),
         (["--network", "equivariant", "--set", "network.relaxation=weights"], "network.relaxation"),
         (["--network", "equivariant", "--set", "network.relaxation=weights", "--set", "network.relax=1"], None),
-        (["--consistency-coef", "0.2", "--transforms", "c4"], None),
+        (["--set", "prior.consistency_coef=0.2", "--transforms", "c4"], None),
         (["--set", "prior.replay=stored"], "prior.replay"),
         (["--set", "mappo.truncation=5", "--set", "mappo.critic_activation=tanh"], "mappo.truncation"),
         (["--network", "gru", "--set", "mappo.truncation=5"], None),
@@ -178,9 +178,12 @@ def test_what_was_measured_before_training_is_told(tmp_path: Path, monkeypatch: 
         ),
         (["--network", "cnn"], "unknown network 'cnn'; the networks are mlp, gru"),
         (["--network", "gru", "--set", "mappo.num_steps=10"], "set mappo.num_steps to a multiple of 25"),
-        (["--consistency-coef", "-1"], "--consistency-coef"),
-        (["--consistency-coef", "nan"], "--consistency-coef"),
-        (["--consistency-coef", "inf"], "bad value inf for 'prior.consistency_coef': it has to be a finite number"),
+        (["--set", "prior.consistency_coef=-1"], "prior.consistency_coef"),
+        (["--set", "prior.consistency_coef=nan"], "prior.consistency_coef"),
+        (
+            ["--set", "prior.consistency_coef=inf"],
+            "bad value inf for 'prior.consistency_coef': it has to be a finite number",
+        ),
         (["--steps", "some"], "'some' is not a number of steps"),
         (["--seeds", "2,2"], "name one seed twice"),
         (["--seeds", "0"], "0 seeds cannot be trained at once"),
@@ -278,7 +281,7 @@ def test_a_second_interrupt_stops_at_once(tmp_path: Path, monkeypatch: pytest.Mo
         (["--seeds", "10", "--out", "elsewhere"], "--seeds, --out"),
         (["--task", "navigation", "--prior", "none"], "--task, --prior"),
         (["-a", "mappo", "--preset", "paper", "--transforms", "c4"], "--algo, --preset, --transforms"),
-        (["--network", "gru", "--consistency-coef", "1"], "--consistency-coef, --network"),
+        (["--network", "gru", "--transforms", "c4"], "--transforms, --network"),
         (["--device", "cpu", "--set", "mappo.gamma=0.9"], "--device, --set"),
     ],
 )

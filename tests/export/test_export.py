@@ -235,7 +235,7 @@ def test_an_export_whose_folder_is_replaced_ends_and_leaves_the_other_folder_alo
 
 
 def test_the_command_lists_every_format() -> None:
-    assert (*FORMATS, "policy") == command.FORMATS
+    assert tuple(FORMATS) == command.FORMATS
 
 
 def test_a_policy_that_the_rounding_of_its_observations_moves_is_no_bug_of_the_export() -> None:

@@ -124,13 +124,6 @@ def test_what_a_robot_cannot_see_is_told(tmp_path: Path, monkeypatch: pytest.Mon
         pilot.observations(poses[:1], goals[:1], [(0.5, 0.5)])
 
 
-@pytest.mark.parametrize("setting", ["heading_offset_rad", "blind_sector_rad"])
-def test_what_is_not_built_from_poses_is_exported_without_a_pilot(tmp_path: Path, setting: str) -> None:
-    export(drawn_policy("wheels", **{setting: 1.0}), ["numpy"], tmp_path)
-    assert not (tmp_path / "esp_epuck.py").exists()
-    assert "from poses" not in (tmp_path / "README.md").read_text()
-
-
 def node(name: str, pose) -> SimpleNamespace:
     """Return Webots' node of a body that stands where `pose` says."""
 

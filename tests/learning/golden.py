@@ -64,8 +64,6 @@ CASES: dict[str, str] = {
     # the parts of the prior and the kinds of elements
     "plain": f"{_NAVIGATION} --prior none",
     "augmentation alone, all copies": f"{_NAVIGATION} --prior augment --set prior.copies=all --transforms rot90,flip-x",
-    "consistency of the policy alone": f"{_NAVIGATION} --prior consistency --set prior.terms=policy",
-    "consistency of the value alone": f"{_NAVIGATION} --prior consistency --set prior.terms=value",
     "agents permuted": f"{_NAVIGATION} --transforms d4*agents --seeds 2",
     "agents permuted, a value each": (
         f"{_NAVIGATION} --transforms agents --set mappo.critic_input=own --set mappo.clip_value=true"
@@ -101,9 +99,9 @@ CASES: dict[str, str] = {
         " --transforms rot90,flip-y*agents-1-2-0 --set prior.copies=all --set prior.replay=stored"
     ),
     "paper's maddpg": "--task navigation --algo maddpg --preset paper --set maddpg.rounds=10 --steps 250",
-    "qmix gru, all copies, value alone": (
+    "qmix gru, all copies": (
         f"--task navigation --algo qmix {_OFF_POLICY} --network gru --transforms rot90,agents-1-2-0"
-        " --set prior.copies=all --set prior.terms=value --set qmix.target_every=10"
+        " --set prior.copies=all --set qmix.target_every=10"
     ),
     "paper's qmix": "--task navigation --algo qmix --preset paper --set qmix.rounds=10 --steps 250",
     # wheel pairs and pictures

@@ -113,8 +113,6 @@ def test_the_penalty_by_hand():
         return prior(**choice).copies(rows(), []).penalty(policy=(Squared(), logits), value=values).value.tolist()
 
     assert penalty() == [0.5 * (2 + 4)] * 2
-    assert penalty(terms="policy") == [0.5 * 2] * 2
-    assert penalty(terms="value") == [0.5 * 4] * 2
     assert penalty(kind="augment") == 0
     assert penalty(consistency_coef=0) == 0
 

@@ -227,13 +227,9 @@ def test_a_compass_tells_directions_and_agents_apart_but_no_items() -> None:
         SymmetryPrior(PriorConfig(transforms="landmarks-3", compass=1.0), framed(spec))
 
 
-BROKEN = [{"wind": 0.3}, {"gust_mean": 1.0}, {"wind": 0.3, "gust_mean": 2.0}]
-
-
-@pytest.mark.parametrize("settings", BROKEN, ids=str)
-def test_with_the_compass_the_dynamics_commute_with_every_element_and_without_they_do_not(settings) -> None:
+def test_with_the_compass_the_dynamics_commute_with_every_element_and_without_they_do_not() -> None:
     """Fit the change of velocity, linear in what an agent sees and does; hold the fit to transformed transitions."""
-    env = Compass(make("navigation", 64, [0], {"actions": "continuous", "num_agents": 1, **settings}), 1.0)
+    env = Compass(make("navigation", 64, [0], {"actions": "continuous", "num_agents": 1, "wind": 0.3}), 1.0)
     here = env.reset().obs
     action = env.random_action()
     there = env.step(action).next.obs
@@ -242,8 +238,7 @@ def test_with_the_compass_the_dynamics_commute_with_every_element_and_without_th
         seen, then = here[..., :width], there[..., :width]
         force = action / action.norm(dim=-1, keepdim=True).clamp_min(1.0)
         # the map that is equivariant where it can be: a constant force is a combination of the frame's axes
-        constant = torch.tensor([[settings.get("wind", 0.0) * 5 + settings.get("gust_mean", 0.0)],
-                                 [settings.get("gust_mean", 0.0)]])  # fmt: skip
+        constant = torch.tensor([[0.3 * 5], [0.0]])
 
         def predicted(obs, force, compass=compass, constant=constant):
             axes = obs[..., -4:].unflatten(-1, (2, 2)) if compass else torch.eye(2)
@@ -258,7 +253,7 @@ def test_with_the_compass_the_dynamics_commute_with_every_element_and_without_th
 
 
 def test_exchanged_agents_keep_a_number_of_their_own() -> None:
-    env = Compass(make("navigation", 2, [0], {"weak_agent": 0.5}), 1.0, labels=True)
+    env = Compass(make("navigation", 2, [0]), 1.0, labels=True)
     seen = env.reset()
     assert seen.obs[0, 0, :, -1].tolist() == [-1, 0, 1]
     assert seen.state[0, 0, -3:].tolist() == [-1, 0, 1]

@@ -70,7 +70,7 @@ def test_the_reference_pages_name_every_command_setting_and_task(site: Path) -> 
         (site / "reference" / f"{name}.html").read_text(encoding="utf-8") for name in ("commands", "settings", "tasks")
     )
     assert [name for name in COMMANDS if f'id="esp-{name}"' not in commands] == []
-    assert "<code>--consistency-coef</code>" in commands
+    assert "<code>--transforms</code>" in commands
     assert [name for name in MappoConfig.model_fields if f"<code>mappo.{name}</code>" not in settings] == []
     built_in = [name for name in task_names() if ":" not in name]  # other tests register their own
     assert {"navigation", "wildlife", "ant", "quadruped"} < set(built_in)

@@ -99,26 +99,10 @@ def test_kernels_for_the_processor_change_nothing_on_a_gpu():
     assert "network.compiled" in config.model_copy(update={"device": "cuda"}).without_effect()
 
 
-@pytest.mark.parametrize("kind", ["esp", "consistency"])
-def test_a_consistency_loss_of_the_policy_alone_is_refused_where_there_is_no_policy_to_compare(kind):
-    asked = {"prior.terms": "policy", "prior.kind": kind}
-    with pytest.raises(ValueError, match="terms=policy leaves qmix without a consistency loss"):
-        resolve_config("navigation", "qmix", overrides=asked)
-    assert resolve_config("navigation", "maddpg", overrides=asked).prior.terms == "policy"
-    for without_loss in ({"prior.consistency_coef": 0}, {"prior.kind": "augment"}):
-        resolve_config("navigation", "qmix", overrides=asked | without_loss)
-    assert resolve_config("navigation", "qmix", overrides=asked | {"prior.terms": "value"}).prior.terms == "value"
-
-
-@pytest.mark.parametrize(("algorithm", "idle"), [("qmix", True), ("maddpg", False), ("mappo", False)])
-def test_the_choice_of_terms_is_named_for_a_learner_that_has_one_of_them_alone(algorithm, idle):
-    config = resolve_config("navigation", algorithm, overrides={"prior.terms": "value"})
-    assert ("prior.terms" in config.without_effect()) is idle
-
-
 GONE = [
     ("task_settings", {"prey_policy": None, "prey_policy_seed": 0, "learned_prey": 0.0}, {"learned_prey": 0.5}),
-    ("prior", {"stop_gradient": "none"}, {"stop_gradient": "original"}),
+    ("task_settings", {"gust_mean": 0.0, "gust_std": 0.0, "weak_agent": 0.0}, {"weak_agent": 0.5}),
+    ("prior", {"stop_gradient": "none", "terms": "both"}, {"stop_gradient": "original", "terms": "value"}),
 ]
 """By part of a configuration, settings that went: as earlier versions stored them, and one that they acted on."""
 

@@ -53,9 +53,8 @@ class Formation(BatchedTask):
 
     Reward of robot i, with p its position and d the distance of centres:
         r_i = progress_weight (|p_before - goal| - |p - goal|) - collision_penalty [some body has d < C];
-        convention `paper`: a penalty of 0.35 and C = 0.5 m, convention `tight`: 1.0 and C = 0.15 m. With
-        `penalty_counts` = each the penalty is paid for every body nearer than C. The return of an
-        episode is the mean over robots of the sum over time.
+        convention `paper`: a penalty of 0.35 and C = 0.5 m, convention `tight`: 1.0 and C = 0.15 m. The
+        return of an episode is the mean over robots of the sum over time.
 
     Start: posts missed by up to `start_noise_m` along x and y, headings uniform, everything at rest.
 
@@ -71,8 +70,7 @@ class Formation(BatchedTask):
         turns to the goal and drives.
 
     Symmetry: quarter turns and mirrors (`d4`). A rotation turns headings and vectors and leaves wheels alone, a mirror
-        swaps the wheels. Pillars and goals stand in the state and turn along. Settings that break it leave: `slope` and
-        `blind_sector_rad` the mirror `flip-x`, `heading_offset_rad` quarter turns, `lame_wheel` these without exchange.
+        swaps the wheels. Pillars and goals stand in the state and turn along. `slope` leaves the mirror `flip-x`.
 
     Versions: 1, the first.
     """
@@ -162,8 +160,6 @@ class Formation(BatchedTask):
         speeds = chosen * self._wheel_factor * MAX_WHEEL_SPEED
         if self.settings.slope:
             speeds *= 1 - self.settings.slope * self._direction[..., :1] * np.sign(speeds)
-        if self.settings.lame_wheel:
-            speeds[:, 0, 0] *= 1 - self.settings.lame_wheel
         return speeds
 
     def _look(self) -> None:
@@ -202,14 +198,8 @@ class Formation(BatchedTask):
             apart, ways = self._apart[..., :robots], self._ways[:, :, :robots]
             offsets.append(rules.nearest(apart, ways, self.settings.seen_robots))
         seen, heading = np.concatenate(offsets, 2), self._heading
-        blind = self.settings.blind_sector_rad
-        hidden = rules.in_sector(seen[:, :, 1:], blind) if blind else None
         if self.settings.sensor_noise_m or self.settings.heading_noise_rad:
             heading, seen = self._disturbed(seen)
-        if hidden is not None:
-            seen[:, :, 1:][hidden] = 0
-        if self.settings.heading_offset_rad:
-            heading = heading + self.settings.heading_offset_rad
         direction = self._direction if heading is self._heading else _direction(heading)
         goal, pillar, others = np.split(seen, [1, 1 + min(pillars, 1)], 2)
         if self.settings.goal_sight_m is not None:

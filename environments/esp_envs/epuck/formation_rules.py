@@ -10,7 +10,7 @@ import math
 import numpy as np
 
 from esp_envs.epuck.formation_spec import FormationSettings
-from esp_envs.epuck.robot import BODY_RADIUS_M, MAX_SPEED_M_S, MAX_SPIN_RAD_S, Array, Flags
+from esp_envs.epuck.robot import BODY_RADIUS_M, MAX_SPEED_M_S, MAX_SPIN_RAD_S, Array
 from esp_envs.scene import PALE, Body, Scene, look
 
 FADING_M = 0.2  # gap over which the sight `nearness` of a body fades to 1/e
@@ -40,11 +40,6 @@ def nearness(offset: Array, reach_m: float) -> Array:
     return offset / distance * np.exp(-np.maximum(distance - reach_m, 0) / FADING_M)
 
 
-def in_sector(offset: Array, width_rad: float) -> Flags:
-    """Return which offsets [..., 2] lie in the sector of this width around the direction of x, [...]."""
-    return np.abs(np.arctan2(offset[..., 1], offset[..., 0])) < width_rad / 2
-
-
 def within(offset: Array, unit_m: float) -> Array:
     """Return offsets [..., 2] in a unit of length, those that are longer than one cut to one."""
     return offset / np.maximum(length(offset), unit_m)[..., None]
@@ -52,9 +47,7 @@ def within(offset: Array, unit_m: float) -> Array:
 
 def step_reward(settings: FormationSettings, progress: Array, apart: Array) -> Array:
     """Return g_i + c_i [W, N] for `progress` [W, N] m; `apart` [W, N, N + M] m are to centres of robots and pillars."""
-    near = apart < settings.radius
-    count = near.any(-1) if settings.penalty_counts == "any" else near.sum(-1)
-    return settings.progress_weight * progress - settings.penalty * count
+    return settings.progress_weight * progress - settings.penalty * (apart < settings.radius).any(-1)
 
 
 def towards(wish: Array, heading: Array, control_period_s: float) -> Array:

@@ -66,9 +66,6 @@ class FormationSettings(TaskSettings):
     penalty_radius_m: float | None = Setting(
         None, gt=0, description="C, distance of centres, m; 0.5 by default, 0.15 in the convention tight"
     )
-    penalty_counts: Literal["any", "each"] = Setting(
-        "any", description="the penalty counts once a step, or once for each body that is too near"
-    )
     arrival_radius_m: float = Setting(0.05, gt=0, description="r_arrival, distance at which a robot has arrived, m")
     start_noise_m: float = Setting(0.01, ge=0, le=0.01, description="posts are missed by up to this along x and y, m")
     sensor_noise_m: float = Setting(0.0, ge=0, le=1e3, description="standard deviation of each seen coordinate, m")
@@ -82,15 +79,6 @@ class FormationSettings(TaskSettings):
 
     slope: Annotated[float, Breaks("flip-x")] = Setting(
         0.0, ge=0, lt=1, description="breaks symmetry: share of a wheel's speed lost uphill, along x, and won downhill"
-    )
-    lame_wheel: Annotated[float, Breaks("c4", agents=False)] = Setting(
-        0.0, ge=0, le=1, description="breaks mirrors: share of its speed that the first robot's left wheel lacks"
-    )
-    heading_offset_rad: Annotated[float, Breaks("c4")] = Setting(
-        0.0, ge=0, le=3.15, description="breaks mirrors: the seen heading is off by this, rad"
-    )
-    blind_sector_rad: Annotated[float, Breaks("flip-x")] = Setting(
-        0.0, ge=0, le=6.3, description="breaks symmetry: width of the sector around x in which no body is seen, rad"
     )
 
     def without_effect(self) -> frozenset[str]:
@@ -147,8 +135,7 @@ def formation_spec(settings: FormationSettings) -> TaskSpec:
     """Return the spec that follows from the settings."""
     robots, pillars = settings.num_agents, settings.num_obstacles
     unit = "m" if settings.seen_as == "offset" else "nearness"
-    counts = "once" if settings.penalty_counts == "any" else "each"
-    penalty = f"{settings.penalty:g} {counts} a step within {settings.radius:g} m"
+    penalty = f"{settings.penalty:g} once a step within {settings.radius:g} m"
     return TaskSpec(
         name="formation",
         version=1,

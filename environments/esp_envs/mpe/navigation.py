@@ -110,8 +110,8 @@ class Navigation(ParticleTask):
 
     Symmetry: dynamics and reward are invariant under all rotations and reflections of the plane; five discrete moves
     carry those of the square (`d4`), a planar force carries all (`o2`). Settings that break it leave: `wind` and `mud`
-    the mirror `flip-x`, `gust_mean` the mirror `flip-diagonal`, `weak_agent` all but the exchange of agents,
-    `action_turn_rad` the rotations, `reward_offset` (d is measured to places right of the landmarks) `flip-x`.
+    the mirror `flip-x`, `action_turn_rad` the rotations, `reward_offset` (d is measured to places right of the
+    landmarks) `flip-x`.
 
     Heuristics: `nearest` (each agent takes a landmark of its own, above 8 agents by the Hungarian method), `cover`
     (agents share out all landmarks between them, for L > N; where there are at most 4096 ways, N^L, to do so).

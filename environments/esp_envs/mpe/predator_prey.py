@@ -83,9 +83,8 @@ class PredatorPrey(ParticleTask):
 
     Symmetry: dynamics and reward are invariant under all rotations and reflections; discrete moves carry `d4`, forces
     `o2`. The prey's own bounds are a square, so `control="prey"` has `d4` only. Settings that break the
-    symmetry leave: `wind` and `mud` the mirror `flip-x`, `gust_mean` the mirror `flip-diagonal`, `weak_agent` all but
-    the exchange of predators, `action_turn_rad` the rotations, `reward_offset` (who touches a place right of the prey
-    is rewarded) the mirror `flip-x`.
+    symmetry leave: `wind` and `mud` the mirror `flip-x`, `action_turn_rad` the rotations, `reward_offset` (who touches
+    a place right of the prey is rewarded) the mirror `flip-x`.
 
     Heuristics: `chase` (predators run at the prey; with `control="prey"`: the fleeing prey).
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Annotated, ClassVar, Literal
 
 import torch
@@ -43,17 +42,8 @@ class ParticleSettings(TaskSettings):
     wind: Annotated[float, Breaks("flip-x")] = Setting(
         0.0, ge=0, le=10, description="breaks symmetry: a force on every body along x, as a share of its full force"
     )
-    gust_mean: Annotated[float, Breaks("flip-diagonal")] = Setting(
-        0.0, ge=0, le=100, description="breaks symmetry: mean of a random force per step and axis, length/s^2"
-    )
-    gust_std: Annotated[float, Breaks(None)] = Setting(
-        0.0, ge=0, le=100, description="standard deviation of that force; alone it keeps the symmetry in distribution"
-    )
     mud: Annotated[float, Breaks("flip-x")] = Setting(
         0.0, ge=0, le=1, description="breaks symmetry: share of the velocity that a step costs more where x > 0"
-    )
-    weak_agent: Annotated[float, Breaks(None, agents=False)] = Setting(
-        0.0, ge=0, lt=1, description="breaks the exchange of agents: share of its force that the first one lacks"
     )
     action_turn_rad: Annotated[float, Breaks("turns")] = Setting(
         0.0, ge=0, le=3, description="breaks mirrors: the learners' forces are turned by this angle, which nobody sees"
@@ -112,10 +102,8 @@ class ParticleTask(BatchedTask):
     def __init__(self, settings: ParticleSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
         super().__init__(settings, num_envs, generators)
         spec, bodies = self.spec, self._bodies()
-        gain = torch.tensor(bodies.gain, device=self.device).view(-1, 1, 1)
-        weak = (bodies.gain[0] * (1 - settings.weak_agent), *bodies.gain[1:])
         num_worlds, velocity_first = self.num_seeds * num_envs, settings.convention == "esp"
-        made = replace(bodies, gain=weak), num_worlds, self.device, velocity_first
+        made = bodies, num_worlds, self.device, velocity_first
         self.worlds = (
             ManyWorlds(*made, settings.sees, settings.team, self.solid) if settings.many else ParticleWorlds(*made)
         )
@@ -130,11 +118,8 @@ class ParticleTask(BatchedTask):
         self._directions = torch.tensor(directions, dtype=torch.int8, device=self.device).view(1, 4, 1)
         self._points = torch.tensor(MOVES.points, device=self.device)
         self._extents = torch.tensor(bodies.extent, device=self.device).view(-1, 1, 1)
-        push = torch.cat([gain * settings.wind, torch.zeros_like(gain)], 1) + settings.gust_mean
-        self._push = push if settings.wind or settings.gust_mean else None
-        if settings.gust_std:
-            self._gusts = torch.zeros(spec.horizon, bodies.num_agents, 2, lanes, device=self.device)
-            self.world["gusts"] = self._by_world(self._gusts)
+        gain = torch.tensor(bodies.gain, device=self.device).view(-1, 1, 1)
+        self._push = torch.cat([gain * settings.wind, torch.zeros_like(gain)], 1) if settings.wind else None
         self._shift = torch.tensor([[settings.reward_offset], [0.0]], device=self.device)
         self._readout: Tensor | None = None
         if not settings.many:
@@ -168,11 +153,7 @@ class ParticleTask(BatchedTask):
         places = (unit * self._extents).permute(2, 0, 1)
         fields = [field for field in self.spec.state.fields if not field.name.endswith("velocity")]
         parts = places.split([field.count for field in fields], 1)
-        drawn = {field.name: part for field, part in zip(fields, parts, strict=True)} | self._chance(generator)
-        if self.settings.gust_std:
-            gusts = torch.randn((*self._gusts.shape[:3], self.num_envs), generator=generator, device=self.device)
-            drawn["gusts"] = gusts.movedim(-1, 0)
-        return drawn
+        return {field.name: part for field, part in zip(fields, parts, strict=True)} | self._chance(generator)
 
     def _begin_with(self, drawn: World) -> None:
         self.worlds.velocity.zero_()
@@ -183,11 +164,7 @@ class ParticleTask(BatchedTask):
     def _advance(self, world: World, action: Tensor) -> Outcome:
         self._act(action)
         self._drive()
-        push = self._push
-        if self.settings.gust_std:
-            gust = self._gusts[self._time] * self.settings.gust_std
-            push = gust if push is None else gust + push
-        self.worlds.advance(self._control, push, self.settings.mud)
+        self.worlds.advance(self._control, self._push, self.settings.mud)
         reward, metrics = self._outcome()
         worlds, lead = self.worlds.num_worlds, self._worlds_shape
         per_world = reward[:worlds].view(lead) if reward.dim() == 1 else self._by_world(reward)
@@ -207,7 +184,7 @@ class ParticleTask(BatchedTask):
         self.worlds.measure()
 
     def _to_save(self) -> dict[str, Tensor]:
-        return {"physics": self.worlds.rows()} | ({"gusts": self._gusts} if self.settings.gust_std else {})
+        return {"physics": self.worlds.rows()}
 
     def _take_back(self, saved: dict[str, Tensor]) -> None:
         for name, values in self._to_save().items():

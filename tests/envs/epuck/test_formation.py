@@ -88,7 +88,7 @@ PLACES = [(0.0, 0.0), (0.3, 0.0), (0.0, 0.4), (-0.9, -0.9)]
     ("settings", "expected"),
     [
         ({}, [-0.35, -0.35, -0.35, 0.0]),
-        ({"penalty_counts": "each", "penalty_radius_m": 0.45}, [-0.7, -0.35, -0.35, 0.0]),
+        ({"penalty_radius_m": 0.45}, [-0.35, -0.35, -0.35, 0.0]),
         ({"convention": "tight"}, [0.0, 0.0, 0.0, 0.0]),
         ({"penalty_radius_m": 0.35, "collision_penalty": 2.0}, [-2.0, -2.0, 0.0, 0.0]),
         ({"convention": "tight", "penalty_radius_m": 0.35}, [-1.0, -1.0, 0.0, 0.0]),
