@@ -96,7 +96,7 @@ def join(several: Sequence[Results]) -> Results:
     """Return the results of studies of one kind as those of one study, the cells in their order.
 
     A cell that two of them have with the same returns, as a run and its repetition do, counts once; of a cell that one
-    of them has not finished, the other one's returns count.
+    of them has not finished, the other one's returns count. Cells of one name in other panels are other cells.
 
     Raises:
         UserError: kinds or evaluations that do not go together, or a cell that two of them have with other returns.
@@ -106,7 +106,10 @@ def join(several: Sequence[Results]) -> Results:
         raise UserError("results of studies of different kinds, or of different evaluations, have no table in common")
     cells: dict[str, CellResult] = {}
     for results in several:
-        for cell in results.cells:
+        own = results.cells
+        if any(cell.name in cells and cells[cell.name].panel != cell.panel for cell in own):
+            own = tuple(in_panel(cell) for cell in own)
+        for cell in own:
             there = cells.get(cell.name)
             if there is None or (cell.returns and not there.returns):
                 whole = {"config": results.config | cell.config, "episodes": cell.episodes or results.episodes}
@@ -115,6 +118,12 @@ def join(several: Sequence[Results]) -> Results:
                 raise UserError(f"{cell.name} stands in two of the results files, with different returns")
     command = "\n".join(dict.fromkeys(results.command for results in several))
     return first.model_copy(update={"command": command, "config": {}, "cells": tuple(cells.values())})
+
+
+def in_panel(cell: CellResult) -> CellResult:
+    """Return a cell whose name, and whose reference's, begin with the panel."""
+    reference = cell.reference and f"{cell.panel}: {cell.reference}"
+    return cell.model_copy(update={"name": f"{cell.panel}: {cell.name}", "reference": reference})
 
 
 def methods_table(results: Results, early: bool = False) -> Table:

@@ -74,7 +74,7 @@ FIGURES: dict[str, tuple[Panel, ...]] = {
     ),
     "replay": (
         Panel("replay", "learner and copies", ["learner and copies"], "greedy return", "copies, 500k steps"),
-        Panel("replay", "", [""], "150k", "the horizon, 150k steps"),
+        Panel("replay", "", [""], "navigation, 150k", "the horizon, 150k steps"),
     ),
     "speed": (Panel("speed", "layout", ["layout", "seeds"], "seed-steps/s", "seed-steps per second"),),
 }

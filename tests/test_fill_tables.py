@@ -242,6 +242,16 @@ def test_a_cell_that_one_file_has_not_finished_is_taken_from_the_other(tmp_path)
         join([results, results.model_copy(update={"cells": (first, other)})])
 
 
+def test_cells_of_one_name_in_other_panels_are_other_cells(tmp_path):
+    ends = {"MAPPO": [-150.0, -160.0, -140.0], "MAPPO-ESP": [-130.0, -120.0, -140.0]}
+    results = collect_study(write_study(tmp_path / "s", small_study(), ends)).results
+    moved = tuple(cell.model_copy(update={"panel": "elsewhere", "returns": {}}) for cell in results.cells)
+    plain, prior, other_plain, other_prior = join([results, results.model_copy(update={"cells": moved})]).cells
+    assert (plain.name, prior.reference) == (results.cells[0].name, results.cells[1].reference)
+    assert other_plain.name == f"elsewhere: {plain.name}"
+    assert other_prior.reference == f"elsewhere: {prior.reference}"
+
+
 def test_the_papers_whole_table_marks_what_was_not_run(tmp_path):
     study = small_study(steps=((None, 500_000),))
     ends = {"MAPPO": [-150.0, -160.0, -140.0], "MAPPO-ESP": [-130.0, -120.0, -140.0]}
