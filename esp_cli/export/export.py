@@ -24,7 +24,7 @@ from esp_cli.export.program import Program, program_of
 from esp_cli.export.templates import RUNTIME, filled
 from esp_cli.export.torch_file import torch_archive, torch_runner
 from esp_cli.files.documents import parse_object
-from esp_cli.files.opening import read_regular, require_held, taking_turns
+from esp_cli.files.opening import read_regular
 from esp_cli.files.writing import replace_file
 from esp_cli.policies.loading import TrainedPolicy
 from esp_envs.errors import UserError
@@ -117,7 +117,7 @@ def export(trained: TrainedPolicy, formats: Sequence[str], folder: Path, force: 
     written = {name: content for own in files.values() for name, content in own.items()}
     written[DESCRIPTION] = (json.dumps(job.description | {"formats": formats}, indent=2) + "\n").encode()
     written["README.md"] = _readme(job, results)
-    _write(written, folder, force, formats)
+    _write(written, folder, force)
     program = job.program
     return Exported(results, program.num_parameters, c_file.cost(program) if "c" in formats else None)
 
@@ -146,21 +146,17 @@ def _refuse_mixture(formats: Sequence[str], folder: Path) -> None:
         )
 
 
-def _write(files: Files, folder: Path, force: bool, formats: Sequence[str]) -> None:
-    """Put files into a folder, each as a whole; another export into the same folder comes before or after it."""
+def _write(files: Files, folder: Path, force: bool) -> None:
+    """Put files into a folder, each as a whole."""
     if folder.exists() and not folder.is_dir():
         raise UserError(f"{folder} is a file; name a folder for the export with --out")
     folder.mkdir(parents=True, exist_ok=True)
-    with taking_turns(folder):
-        if force:
-            _refuse_mixture(formats, folder)  # again: another export may have come first
-        taken = sorted(name for name in files if (folder / name).exists())
-        if taken and not force:
-            raise UserError(f"{folder} has {taken[0]} already; choose another --out, or replace it with --force")
-        for name, content in files.items():
-            require_held(folder)
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            replace_file(folder / name, content)
+    taken = sorted(name for name in files if (folder / name).exists())
+    if taken and not force:
+        raise UserError(f"{folder} has {taken[0]} already; choose another --out, or replace it with --force")
+    for name, content in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        replace_file(folder / name, content)
 
 
 def _checked(name: str, files: Files, job: Job) -> Export:

@@ -15,7 +15,7 @@ import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from esp_cli.files.opening import open_folder, open_own, require_held
+from esp_cli.files.opening import open_own
 from esp_envs.errors import UserError
 
 MAX_LINE_BYTES = 16 * 2**20  # of a file of lines, such as metrics; what is longer was not written by this program
@@ -69,37 +69,37 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Callable[[bytes], None]]
     the folder's own entry is flushed. A link there is replaced, not followed. After an exception the file is as before.
     """
     path = Path(path)
-    temporary = f"{TEMPORARY_PREFIX}{secrets.token_hex(8)}"
-    with _named(path), _folder_of(path) as folder:
+    temporary = path.with_name(f"{TEMPORARY_PREFIX}{secrets.token_hex(8)}")
+    try:
+        # not tempfile.mkstemp, which would make every file readable by its owner alone whatever the umask says
+        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
         try:
-            # not tempfile.mkstemp, which would make every file readable by its owner alone whatever the umask says
-            descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666, dir_fd=folder)
-            try:
-                with contextlib.suppress(OSError):  # a new file, or one of somebody else
-                    if stat.S_ISREG((before := os.lstat(path.name, dir_fd=folder)).st_mode):
-                        os.fchmod(descriptor, before.st_mode & 0o777)
-                yield functools.partial(write_all, descriptor)
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
-            require_held(path)
-            os.replace(temporary, path.name, src_dir_fd=folder, dst_dir_fd=folder)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                os.unlink(temporary, dir_fd=folder)
-            raise
-        with contextlib.suppress(OSError):  # some network file systems cannot flush a folder, where the rename stands
-            entries = os.open(".", os.O_RDONLY | os.O_CLOEXEC, dir_fd=folder)
-            try:
-                os.fsync(entries)
-            finally:
-                os.close(entries)
+            with contextlib.suppress(OSError):  # a new file, or one of somebody else
+                if stat.S_ISREG((before := path.lstat()).st_mode):
+                    os.fchmod(descriptor, before.st_mode & 0o777)
+            yield functools.partial(write_all, descriptor)
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+        temporary.replace(path)
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        if isinstance(error, OSError):  # it names the file itself, not the temporary one beside it
+            raise OSError(error.errno, error.strerror, os.fspath(path)) from None
+        raise
+    with contextlib.suppress(OSError):  # some network file systems cannot flush a folder, where the rename stands
+        entries = os.open(path.parent, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            os.fsync(entries)
+        finally:
+            os.close(entries)
 
 
 def remove_file(path: Path) -> None:
     """Remove a file if it is there."""
-    with _named(path), contextlib.suppress(FileNotFoundError), _folder_of(path) as folder:
-        os.unlink(path.name, dir_fd=folder)
+    with contextlib.suppress(FileNotFoundError):
+        path.unlink()
 
 
 def sync_file(path: Path) -> None:
@@ -114,21 +114,3 @@ def write_all(descriptor: int, content: bytes) -> None:
     rest = memoryview(content)
     while rest:
         rest = rest[os.write(descriptor, rest) :]
-
-
-@contextlib.contextmanager
-def _folder_of(path: Path) -> Iterator[int]:
-    descriptor = open_folder(path.parent)
-    try:
-        yield descriptor
-    finally:
-        os.close(descriptor)
-
-
-@contextlib.contextmanager
-def _named(path: Path) -> Iterator[None]:
-    """Let a failure name the file itself, not the temporary one beside it."""
-    try:
-        yield
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, os.fspath(path)) from None

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from esp_cli.files.formatting import sentence
-from esp_cli.files.opening import require_held
 from esp_cli.studies.engine import Engine, Job
 from esp_cli.studies.run_set import Cell, RefusedError, RunSet
 from esp_envs.errors import UserError
@@ -72,8 +71,7 @@ class Scheduler:
     def run(self, listener: Listener, poll_s: float = POLL_S) -> bool:
         """Run everything that is not finished; a run that fails is left as it is and the others go on.
 
-        The listener is told every `poll_s` seconds; where it asks to stop, False is returned. If the folder of the
-        study was moved, replaced or deleted, its processes are ended, with a FolderLostError.
+        The listener is told every `poll_s` seconds; where it asks to stop, False is returned.
         """
         going = True
         for run in self.runs:
@@ -82,7 +80,6 @@ class Scheduler:
                 self.folder.end(run.cell)
         try:
             while True:
-                require_held(self.folder.path)
                 if going:
                     self._fill()
                 active = [run for run in self.runs if run.is_active]

@@ -23,7 +23,7 @@ from pydantic import Field, ValidationError
 from esp_cli.defaults import __version__
 from esp_cli.files.documents import MAX_DOCUMENT_BYTES, DocumentError, DocumentFormat, Strict, parse_object, validate
 from esp_cli.files.formatting import shortened
-from esp_cli.files.opening import open_own, read_regular, require_held
+from esp_cli.files.opening import open_own, read_regular
 from esp_cli.files.writing import remove_file
 from esp_cli.policies.evaluation import FinalEvaluation
 from esp_cli.studies.run_set import FOLDER_NAME, Cell, RunSet, StudyError
@@ -200,7 +200,6 @@ class StudyFolder(RunSet):
     def adopt(self, cell: Cell, twin: Path) -> None:
         """Take a finished run over as this cell's, without links, which bring in files from anywhere; its log tells."""
         part = self.path / self.runs / f".{cell.name}.part"
-        require_held(part)
         shutil.rmtree(part, ignore_errors=True)  # what a kill left
         shutil.copytree(twin, part, ignore=lambda folder, names: [n for n in names if Path(folder, n).is_symlink()])
         with os.fdopen(open_own(part / LOG, os.O_WRONLY | os.O_APPEND), "a", encoding="utf-8") as log:

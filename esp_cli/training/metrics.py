@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from esp_cli.files.formatting import Shown, attempting
-from esp_cli.files.opening import open_own, open_regular, require_held
+from esp_cli.files.opening import open_own, open_regular
 from esp_cli.files.writing import MAX_LINE_BYTES, TAIL_BYTES, replacing, write_all
 from esp_cli.training.trackers import Guarded
 from esp_envs.errors import UserError
@@ -73,7 +73,6 @@ class MetricsWriter:
                 row[name] = [None if k in without else number for k, number in enumerate(numbers)]
         line = json.dumps({"step": int(step), **row}, allow_nan=False, separators=(",", ":")).encode() + b"\n"
         with attempting("write", self._path, MetricsError):
-            require_held(self._path)
             write_all(self._descriptor, line)
         for tracker in self._trackers:
             tracker.write(int(step), row)

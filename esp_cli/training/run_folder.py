@@ -29,7 +29,7 @@ from torch import Tensor
 
 from esp_cli.files.documents import DocumentFormat
 from esp_cli.files.formatting import attempting
-from esp_cli.files.opening import holding, open_own, require_held
+from esp_cli.files.opening import holding, open_own
 from esp_cli.files.writing import TEMPORARY_PREFIX, remove_file, sync_file
 from esp_cli.training.checkpoint import (
     CHECKPOINT_FORMAT,
@@ -88,7 +88,6 @@ class RunFolder:
         with attempting("make the run folder", path, RunFolderError):
             if path.exists() and not path.is_dir():
                 raise RunFolderError(f"{path} is a file; choose another --out")
-            require_held(path)
             path.mkdir(parents=True, exist_ok=True)
             _refuse_taken(path)
             folder = cls(path, config, secrets.token_hex(16))
@@ -145,7 +144,6 @@ class RunFolder:
         """
         path = self.checkpoint_path(step, final)
         with attempting("write", path, RunFolderError):
-            require_held(path)
             path.parent.mkdir(exist_ok=True)
             sync_file(self.metrics_path)
         stamp = {RUN_ID: self.identity, CONFIG_SHA256: self._config_sha256}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +17,6 @@ from esp_cli.export.check import compare, take_sample
 from esp_cli.export.export import FORMATS, export
 from esp_cli.export.numpy_policy import NumpyPolicy
 from esp_cli.export.program import program_of
-from esp_cli.files.opening import FolderLostError, taking_turns
-from esp_cli.files.writing import replace_file
-from esp_envs.errors import UserError
 from tests.export.policies import KINDS, drawn_policy, imported
 
 pytestmark = pytest.mark.usefixtures("few_scenes")
@@ -197,41 +193,6 @@ def test_a_file_in_the_way_of_the_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ValueError, match="is a file; name a folder"):
         export(drawn_policy("wheels"), ["numpy"], tmp_path / "file")
-
-
-@pytest.mark.parametrize("force", [False, True])
-def test_two_exports_into_one_folder_come_one_after_the_other(force: bool, tmp_path: Path) -> None:
-    trained, place = drawn_policy("wheels"), tmp_path / "out"
-    place.mkdir()
-    with ThreadPoolExecutor() as pool:
-        with taking_turns(place):
-            second = pool.submit(export, trained, ["onnx"], place, force)
-            assert not wait([second], 1).done
-            for name in ("policy.py", "README.md", "policy.json"):
-                (place / name).write_text('{"formats": ["numpy"]}')  # as the first does
-        with pytest.raises(UserError, match="other formats; write them anew" if force else "README.md already"):
-            second.result()
-    assert sorted(file.name for file in place.iterdir()) == ["README.md", "policy.json", "policy.py"]
-
-
-@pytest.mark.parametrize("written", [1, 2, 3])
-def test_an_export_whose_folder_is_replaced_ends_and_leaves_the_other_folder_alone(
-    written: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    place, calls = tmp_path / "out", []
-
-    def moving(path: Path, content: bytes) -> None:
-        replace_file(path, content)
-        calls.append(path)
-        if len(calls) == written:
-            place.rename(tmp_path / "old")
-            place.mkdir()
-            (place / "README.md").write_text("of another")
-
-    monkeypatch.setattr("esp_cli.export.export.replace_file", moving)
-    with pytest.raises(FolderLostError, match="was moved, replaced or deleted"):
-        export(drawn_policy("wheels"), ["numpy"], place, force=True)
-    assert [(file.name, file.read_text()) for file in place.iterdir()] == [("README.md", "of another")]
 
 
 def test_the_command_lists_every_format() -> None:

@@ -8,7 +8,6 @@ import math
 import runpy
 import shlex
 import shutil
-import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +15,6 @@ import pytest
 
 from esp_cli.commands.counts import parse_count, parse_seeds
 from esp_cli.commands.options import parse_assignments
-from esp_cli.files.opening import taking_turns
 from esp_cli.policies import bundled
 from esp_cli.policies.bundled import MANIFEST, Entry, bundled_folder, find, read_bundled, standard_name
 from esp_cli.policies.evaluation import best_seed, evaluate, play_batches
@@ -233,25 +231,6 @@ def test_a_policy_of_a_task_that_is_not_installed_gets_a_name_that_can_be_writte
     assert standard_name("mine.tasks:My_Task", "mappo", "none") == "mine-tasks-my-task-mappo-plain"
     assert standard_name("pkg._tasks:T", "mappo", "esp") == "pkg-tasks-t-mappo-esp"
     assert standard_name("navigation", "qmix", "esp") == "navigation-qmix-esp"
-
-
-def test_two_exports_into_one_folder_take_turns(tmp_path: Path) -> None:
-    began, order = threading.Event(), []
-
-    def second() -> None:
-        began.set()
-        with taking_turns(tmp_path):
-            order.append("second")
-
-    with taking_turns(tmp_path):
-        other = threading.Thread(target=second)
-        other.start()
-        began.wait()
-        other.join(0.1)
-        order.append("first")
-    other.join()
-    assert order == ["first", "second"]
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_scores_on_file_are_normalised() -> None:

@@ -7,13 +7,12 @@ import sys
 
 import pytest
 
-from esp_cli.files.opening import FolderLostError, LockError, is_held
+from esp_cli.files.opening import LockError, is_held
 from esp_cli.files.writing import TEMPORARY_PREFIX
 from esp_cli.studies.engine import LocalEngine
 from esp_cli.studies.run_set import StudyError
-from esp_cli.studies.scheduler import Scheduler
 from esp_cli.studies.study import StudyFolder, read_evaluation
-from tests.studies.small_studies import small_study, stand_in, write_study
+from tests.studies.small_studies import small_study, write_study
 
 ENDS = {"MAPPO": [-120.0, -121.0, -122.0]}
 
@@ -82,21 +81,6 @@ def test_one_process_holds_a_study(tmp_path):
         assert is_held(path / "study.lock")
     assert not is_held(path / "study.lock")
     assert not is_held(path / "no such file")
-
-
-def test_a_study_whose_folder_is_replaced_writes_nothing_and_ends(tmp_path):
-    path = tmp_path / "s"
-    with StudyFolder.held(path):
-        folder = StudyFolder.create(path, small_study())
-        other = StudyFolder.create(tmp_path / "b", small_study()).path
-        path.rename(tmp_path / "old")
-        other.rename(path)
-        before = sorted(path.rglob("*"))
-        with pytest.raises(FolderLostError, match="was moved, replaced or deleted"):
-            Scheduler(folder, folder.study.cells, 2, LocalEngine(stand_in())).run(lambda look: True)
-        with pytest.raises(FolderLostError, match="was moved, replaced or deleted"):
-            folder.prepare(folder.study.cells[0])
-        assert sorted(path.rglob("*")) == before
 
 
 def test_no_lock_is_made_in_a_folder_of_something_else(tmp_path):
