@@ -30,15 +30,6 @@ def prepare() -> None:
     libc.mallopt(_M_TOP_PAD, 64 * _MEBIBYTE)
 
 
-def busy_with() -> float:
-    """Return how many programs wanted each core in the last minute; 0 where that is unknown."""
-    try:
-        load = os.getloadavg()[0]
-    except OSError:
-        return 0.0
-    return load / (os.cpu_count() or 1)
-
-
 def resolve_device(wanted: str) -> str:
     """Return "cpu" or "cuda" for what --device asks for; a UserError says that there is no such device."""
     if wanted not in ("cpu", "cuda", "auto"):

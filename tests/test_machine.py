@@ -46,15 +46,3 @@ def test_other_systems_are_left_alone(calls, monkeypatch):
     monkeypatch.setattr(platform, "libc_ver", lambda: ("", ""))
     machine.prepare()
     assert not calls
-
-
-def test_the_load_is_told_per_core_and_as_nothing_where_it_is_unknown(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(machine.os, "getloadavg", lambda: (3.0, 1.0, 1.0))
-    monkeypatch.setattr(machine.os, "cpu_count", lambda: 2)
-    assert machine.busy_with() == 1.5
-
-    def unknown() -> tuple[float, float, float]:
-        raise OSError
-
-    monkeypatch.setattr(machine.os, "getloadavg", unknown)
-    assert machine.busy_with() == 0.0

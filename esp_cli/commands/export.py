@@ -100,9 +100,4 @@ def _print(exported: Exported, title: str, out: Path) -> None:
             console.note(result.note)
     headings = ("format", "files", "bytes>", "observations>", "largest difference>", "other choices>")
     console.table(headings, rows, title=title, caption="compared with the policy itself, in float32")
-    costs: list[tuple[str, object]] = [("parameters", exported.parameters)]
-    if exported.c is not None:
-        costs += [("flash of the C source, bytes", f"{exported.c.flash_bytes} and about 1 kB of code")]
-        costs += [("RAM of the C source, bytes", exported.c.ram_bytes)]
-    console.table(("cost", "value>"), costs)
-    console.note(f"{out} has a README, and the worked example in policy.json")
+    console.note(f"{out} has a README, and the worked example in policy.json; parameters: {exported.parameters}")

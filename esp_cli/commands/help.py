@@ -1,26 +1,18 @@
-"""How the help of a command is arranged (groups of options, short words for values), and what Tab completes."""
+"""How the help of a command is arranged (groups of options, short words for values)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, get_args, get_origin
 
-from esp_cli.commands.options import installed_tasks
 from esp_cli.files.formatting import format_count
-
-TASKS = ("navigation", "predator-prey", "formation", "wildlife")
-ALGORITHMS = ("mappo", "maddpg", "qmix")
-NETWORKS = ("mlp", "gru", "mpn", "empn", "set", "set-equivariant", "equivariant")
-PRESETS = ("default", "fast", "paper")
-TRACKERS = ("tensorboard", "wandb", "mlflow")
 
 _TRAINED, _SEARCHED, _PRIOR, _SETTINGS = "What is trained", "What is searched", "Symmetry prior", "Settings"
 _RUN, _OUTPUT, _POLICY, _PICTURE = "How it runs", "Output", "What is evaluated", "Picture"
 _GROUPS: dict[str, tuple[str, ...]] = {
     _TRAINED: ("tasks", "algos", "preset", "steps", "seeds", "seed_list", "drones", "grid", "methods", "group"),
     _SEARCHED: ("budget", "space", "trial_seeds"),
-    _PRIOR: ("transforms", "consistency_coef"),
+    _PRIOR: ("transforms",),
     _SETTINGS: ("settings", "config", "print_config", "init_from"),
     _RUN: ("resume", "device", "jobs", "dry_run", "seconds", "reuse", "engine", "address", "gpu_share", "no_check"),
     _POLICY: (
@@ -38,7 +30,7 @@ _GROUPS: dict[str, tuple[str, ...]] = {
         "threshold",
     ),
     _PICTURE: ("view", "size", "width", "speed", "fps", "style", "plot", "films"),
-    _OUTPUT: ("out", "force", "json", "results", "full", "track", "watch", "formats", "name"),
+    _OUTPUT: ("out", "force", "json", "results", "full", "track", "watch", "formats"),
 }
 _MOVED: dict[str, dict[str, str]] = {  # options that belong elsewhere in a command than in the others
     "train": {"task": _TRAINED, "algo": _TRAINED, "network": _TRAINED, "physics": _TRAINED, "prior": _PRIOR},
@@ -50,31 +42,10 @@ _MOVED: dict[str, dict[str, str]] = {  # options that belong elsewhere in a comm
 _WORDS = {int: "COUNT", float: "NUMBER", Path: "PATH"}
 
 
-def policies() -> tuple[str, ...]:
-    """Return the bundled policies by task and by name; where none fits, the shell offers files."""
-    from esp_cli.policies.bundled import read_bundled
-
-    bundled = read_bundled()
-    return tuple(dict.fromkeys([*(entry.task for entry in bundled), *(entry.name for entry in bundled)]))
-
-
-_COMPLETED: dict[str, Callable[[], tuple[str, ...]]] = {  # by the name of a parameter; none costs an import of torch
-    **dict.fromkeys(("task", "tasks"), lambda: (*TASKS, *installed_tasks())),
-    **dict.fromkeys(("algo", "algos"), lambda: ALGORITHMS),
-    "network": lambda: NETWORKS,
-    "preset": lambda: PRESETS,
-    "track": lambda: TRACKERS,
-    **dict.fromkeys(("policy", "beside"), policies),
-    "of": lambda: (*ALGORITHMS, *TASKS, *NETWORKS, "prior", "evaluation"),
-}
-
-
 def arrange(command: Any) -> Any:
     """Put the options of a command into groups, and say what each takes in a word that leaves room for its meaning."""
     groups = {name: group for group, names in _GROUPS.items() for name in names} | _MOVED.get(command.name, {})
     for parameter in command.params:
-        if names := _COMPLETED.get(parameter.name):
-            parameter._custom_shell_complete = _completer(names)
         kind = parameter.type_descriptor.annotation
         if not parameter.opts[0].startswith("-"):
             parameter.display_type_rich = lambda **_: ""  # the metavar and the help say it
@@ -88,7 +59,3 @@ def arrange(command: Any) -> Any:
         if parameter.name == "steps" and isinstance(parameter.default, int):
             parameter.show_default = format_count(parameter.default)
     return command
-
-
-def _completer(names: Callable[[], tuple[str, ...]]) -> Callable[[Any, object, str], list[str]]:
-    return lambda _context, _of, incomplete: [name for name in names() if name.startswith(incomplete)]

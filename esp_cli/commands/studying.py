@@ -17,7 +17,6 @@ from esp_cli.commands.options import note_without_effect
 from esp_cli.commands.study_options import StudyChoices
 from esp_cli.commands.study_progress import StudyProgress
 from esp_cli.console.progress import stop_requests
-from esp_cli.machine import busy_with
 from esp_cli.training.folder_names import LOG
 from esp_envs.errors import UserError
 from esp_envs.installed import install
@@ -29,8 +28,6 @@ if TYPE_CHECKING:
     from esp_cli.studies.forecast import Forecast
     from esp_cli.studies.scheduler import Scheduler, Snapshot
     from esp_cli.studies.study import Study, StudyFolder
-
-BUSY = 0.5  # load per core from which a forecast is called unreliable
 
 
 @dataclass(frozen=True)
@@ -128,15 +125,9 @@ def forecast_study(kind: str, request: Request, choices: StudyChoices) -> None:
 
 @contextmanager
 def measuring(total: int) -> Iterator[Callable[[int], object]]:
-    """Yield a progress callback; say afterwards if the machine was too busy to measure."""
+    """Yield a progress callback."""
     with console.TrainingProgress(total, description="measure", unit="runs") as progress:
-        busy = busy_with()  # before the measurement, which keeps a core busy itself
         yield progress.update
-    if busy > BUSY:
-        console.note(
-            f"this machine was busy (load {busy:.1f} per core) while this was measured, so the times are unreliable; "
-            "ask again when it is idle"
-        )
 
 
 def print_forecast(found: Forecast, json: str | None, what: str) -> None:

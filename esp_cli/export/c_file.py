@@ -10,7 +10,6 @@ import re
 import shutil
 import subprocess
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -24,21 +23,6 @@ from esp_envs.errors import UserError
 
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
 """The source compiles without warnings under these."""
-
-
-@dataclass(frozen=True)
-class Cost:
-    """The memory that a program in C needs on a microcontroller."""
-
-    flash_bytes: int  # of the weights; the code comes on top (about 1 kB without libm)
-    ram_bytes: int  # of the scratch and of one agent's memory; the stack needs some 100 more
-
-
-def cost(program: Program) -> Cost:
-    """Return what a program in C needs."""
-    scratch = 2 * program.team * _row_width(program) + 6 * program.hidden
-    scratch += sum(layer.scratch for layer in program.layers)
-    return Cost(len(program.weights), 4 * (scratch + program.memory_width))
 
 
 def c_source(program: Program, comment: str) -> dict[str, bytes]:

@@ -23,17 +23,11 @@ from esp_cli.export.onnx_file import onnx_model, onnx_runner
 from esp_cli.export.program import Program, program_of
 from esp_cli.export.templates import RUNTIME, filled
 from esp_cli.export.torch_file import torch_archive, torch_runner
-from esp_cli.files.documents import parse_object
-from esp_cli.files.opening import read_regular
 from esp_cli.files.writing import replace_file
 from esp_cli.policies.loading import TrainedPolicy
 from esp_envs.errors import UserError
 
-STM32F4_FLASH_BYTES, STM32F4_RAM_BYTES = 1024 * 1024, 192 * 1024
-"""Memory of an STM32F407, the microcontroller of the e-puck2."""
-
 DESCRIPTION = "policy.json"
-MAX_DESCRIPTION_BYTES = 1 << 26
 Files = dict[str, bytes]
 
 
@@ -70,11 +64,10 @@ class Export:
 
 @dataclass(frozen=True)
 class Exported:
-    """All formats, and what an action costs."""
+    """All formats."""
 
     formats: tuple[Export, ...]
     parameters: int  # learned numbers
-    c: c_file.Cost | None  # flash and RAM of the C source, where it was written
 
 
 def _c(job: Job) -> Files:
@@ -109,8 +102,6 @@ FORMATS = {
 def export(trained: TrainedPolicy, formats: Sequence[str], folder: Path, force: bool = False) -> Exported:
     """Write one seed's policy in some formats, with `policy.json` and a README, after checking each."""
     formats = tuple(dict.fromkeys(formats))
-    if force:
-        _refuse_mixture(formats, folder)
     job = _job(trained, formats)
     files = {name: FORMATS[name].write(job) for name in formats}
     results = tuple(_checked(name, own, job) for name, own in files.items())
@@ -118,8 +109,7 @@ def export(trained: TrainedPolicy, formats: Sequence[str], folder: Path, force: 
     written[DESCRIPTION] = (json.dumps(job.description | {"formats": formats}, indent=2) + "\n").encode()
     written["README.md"] = _readme(job, results)
     _write(written, folder, force)
-    program = job.program
-    return Exported(results, program.num_parameters, c_file.cost(program) if "c" in formats else None)
+    return Exported(results, job.program.num_parameters)
 
 
 def _job(trained: TrainedPolicy, formats: Sequence[str]) -> Job:
@@ -129,21 +119,6 @@ def _job(trained: TrainedPolicy, formats: Sequence[str]) -> Job:
     drives = "numpy" in formats and not program.memory_width
     robotic = drives and "robot" in description
     return Job(trained, program, sample, description, epuck.take_scenes(trained) if robotic else None)
-
-
-def _refuse_mixture(formats: Sequence[str], folder: Path) -> None:
-    """Refuse to leave files of an earlier export beside those of another policy."""
-    try:
-        description = parse_object(read_regular(folder / DESCRIPTION, MAX_DESCRIPTION_BYTES) or b"", "a description")
-    except (OSError, UserError):
-        return
-    known = description.get("formats")
-    left = [name for name in FORMATS if isinstance(known, list) and name in known and name not in formats]
-    if left:
-        again = " ".join(f"-f {name}" for name in left)
-        raise UserError(
-            f"{folder} holds an export with other formats; write them anew too ({again}), or choose another --out"
-        )
 
 
 def _write(files: Files, folder: Path, force: bool) -> None:
@@ -189,9 +164,6 @@ def _readme(job: Job, results: Sequence[Export]) -> bytes:
         results=results,
         spec=spec,
         program=job.program,
-        c=c_file.cost(job.program),
-        flash_bytes=STM32F4_FLASH_BYTES,
-        ram_bytes=STM32F4_RAM_BYTES,
         states=epuck.STATES,
         robot=description["robot"] if robotic else None,
         fields=[field["field"] for field in description["observation"]],

@@ -38,7 +38,6 @@ class Layer:
     arrays: tuple[Floats, ...] = ()  # learned numbers, in the order in which exports store them
     numbers: tuple[tuple[str, object], ...] = ()  # what JSON says of it, beside the shapes of the arrays
     width: int = 0  # of the widest row that it reads or writes, where another layer does not tell
-    scratch: int = 0  # numbers that C keeps beside rows
 
     def describe(self) -> dict[str, object]:
         """Return the layer as JSON stores it: without its weights, but with their shapes."""

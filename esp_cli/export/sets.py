@@ -44,7 +44,6 @@ def pool_sets(
     """
     features, num_own = len(sets[0].arrays[-1]), own[1].size if own else len(kept)
     outputs = num_own + 2 * features * len(sets) + beside
-    widest = max(len(each.arrays[0]) for each in sets)
     structure = [(each.name, each.place, each.reader) for each in sets]
 
     def pooled(x: Tensor, w: list[Tensor], tables: Mapping[str, Tensor]) -> Tensor:
@@ -83,7 +82,6 @@ def pool_sets(
             ("embeds_own", bool(own)),
         ),
         width=max(inputs + beside, outputs),
-        scratch=len(kept) + 3 * features + widest + sum(near * each.width for each in sets if each.place is not None),
     )
 
 

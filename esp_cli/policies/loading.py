@@ -201,8 +201,7 @@ class Start:
         if self._num_seeds not in (1, seeds):
             raise UserError(
                 f"cannot start {seeds} seed(s) from {self.holder}, which holds {self._num_seeds}; train "
-                f"{self._num_seeds} seeds, or start from one of its seeds: 'esp export {self.holder} --seed K -f "
-                "policy' writes it"
+                f"{self._num_seeds} seeds, or start from a policy of one seed"
             )
         # names before shapes: those that differ are of another algorithm or network
         for name in [*sorted(own.keys() ^ given.keys()), *sorted(own.keys() & given.keys())]:

@@ -16,7 +16,8 @@ from tests.cli.running import esp, refused
 def test_the_best_seed_of_a_run_goes_out(finished: Path, tmp_path: Path) -> None:
     result = esp("export", finished, "-f", "numpy", "-f", "onnx", "-o", tmp_path / "out", "--episodes", 4)
     assert "is the best of 2 over 4 episodes each" in result.stderr
-    for part in ("policy.py", "policy.onnx", "10000", "parameters"):
+    assert "parameters: " in result.stderr
+    for part in ("policy.py", "policy.onnx", "10000"):
         assert part in result.stdout
     files = {file.name for file in (tmp_path / "out").iterdir()}
     assert files == {"policy.py", "policy.onnx", "policy.json", "README.md"}
@@ -29,7 +30,6 @@ def test_the_seed_that_is_named_goes_out(finished: Path, tmp_path: Path) -> None
     written = json.loads(result.stdout)
     (only,) = written["formats"]
     assert (only["name"], only["agreement"]["observations"]) == ("c", 10_000)
-    assert written["c"]["flash_bytes"] == 4 * written["parameters"]
     assert json.loads((tmp_path / "policy.json").read_text())["policy"]["seed"] == 7
 
 
@@ -88,14 +88,6 @@ def test_what_is_there_is_kept_unless_forced(finished: Path, tmp_path: Path) -> 
     esp(*arguments, "--force")
     assert (tmp_path / "policy.py").read_bytes() == before
     assert (tmp_path / "mine.py").exists()
-
-
-def test_no_file_of_another_policy_stays_beside_an_export(finished: Path, tmp_path: Path) -> None:
-    esp("export", finished, "-f", "numpy", "-f", "torch", "-o", tmp_path, "--seed", 3)
-    other = ("export", finished, "-f", "numpy", "-o", tmp_path, "--seed", 7, "--force")
-    assert "holds an export with other formats; write them anew too (-f torch)" in refused(*other)
-    esp(*other, "-f", "torch")
-    assert json.loads((tmp_path / "policy.json").read_text())["formats"] == ["numpy", "torch"]
 
 
 def test_episodes_that_choose_nothing_are_refused(finished: Path, tmp_path: Path) -> None:

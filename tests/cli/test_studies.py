@@ -47,16 +47,6 @@ def test_names_and_steps_are_read_from_lists() -> None:
         parse_study_steps(["formation=soon"])
 
 
-@pytest.mark.parametrize(("load", "unreliable"), [(3.0, True), (0.1, False)])
-def test_a_dry_run_on_a_busy_machine_calls_its_times_unreliable(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, load: float, unreliable: bool
-) -> None:
-    monkeypatch.setattr(studying, "busy_with", lambda: load)
-    told = esp(*TINY, "--steps", 100, *TINY_OPTIONS, "--out", tmp_path / "s", "--dry-run", "--jobs", 2)
-    assert ("this machine was busy (load 3.0 per core)" in told.stderr) == unreliable
-    assert ("the times are unreliable" in told.stderr) == unreliable
-
-
 def test_a_dry_run_states_time_makes_nothing_and_refuses_what_the_run_refuses(tmp_path: Path) -> None:
     out, plan = tmp_path / "s", tmp_path / "plan.json"
     assert "is not empty and no study" in refused(*TINY, *TINY_OPTIONS, "--out", Path(__file__).parent, "--dry-run")

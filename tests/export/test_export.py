@@ -12,7 +12,6 @@ import pytest
 
 from esp_cli.commands import export as command
 from esp_cli.export import c_file, check, onnx_file
-from esp_cli.export.c_file import cost
 from esp_cli.export.check import compare, take_sample
 from esp_cli.export.export import FORMATS, export
 from esp_cli.export.numpy_policy import NumpyPolicy
@@ -96,16 +95,13 @@ def test_another_memory_or_another_bounded_action_is_found(kind: str, spoilt: st
         compare(sample, runner(right | {spoilt: right[spoilt] + wrong}))
 
 
-def test_layers_and_costs_of_a_small_policy_by_hand() -> None:
+def test_layers_of_a_small_policy_by_hand() -> None:
     program = program_of(drawn_policy("wheels", hidden=(3,)).policy)
     first, _, last = program.layers
     assert (first.kind, last.kind) == ("affine", "affine")
     assert (first.arrays[0].shape, last.arrays[0].shape) == ((8, 3), (3, 2))
     assert program.num_parameters == 8 * 3 + 3 + 3 * 2 + 2 == 35
     assert (program.head, program.groups, program.memory_width) == ("squash", (1, 1), 0)
-    needed = cost(program)
-    assert needed.flash_bytes == 4 * 35
-    assert needed.ram_bytes == 4 * (8 + 8), "two rows as wide as the widest layer"
 
 
 def test_layers_of_a_recurrent_policy_with_its_previous_action() -> None:
@@ -172,7 +168,7 @@ def test_every_export_says_what_its_numbers_are(tmp_path: Path) -> None:
     assert len(example["observation"]) == 8
     assert example["action"] == int(np.argmax(example["outputs"]))
     page = (tmp_path / "README.md").read_text()
-    for part in ("   2..3  obstacle: vector x 1 (m)\n", "STM32F407", "never on hardware", "Worked example", "10000"):
+    for part in ("   2..3  obstacle: vector x 1 (m)\n", "never on hardware", "Worked example", "10000"):
         assert part in page
     assert page.count("float64") == 1, "of onnx alone"
     import onnx
@@ -197,16 +193,3 @@ def test_a_file_in_the_way_of_the_folder_is_refused(tmp_path: Path) -> None:
 
 def test_the_command_lists_every_format() -> None:
     assert tuple(FORMATS) == command.FORMATS
-
-
-def test_a_policy_that_the_rounding_of_its_observations_moves_is_no_bug_of_the_export() -> None:
-    sample = take_sample(trained := drawn_policy("choice"), program_of(trained.policy), 100)
-    seen = sample.obs.copy()
-
-    def steep(obs: np.ndarray, memory: np.ndarray, mask: np.ndarray | None) -> tuple:
-        return sample.action, sample.outputs + 1 + 1e6 * (obs - seen)[:, :1], sample.after
-
-    with pytest.raises(ValueError, match="differ by the rounding of float32, so no export can agree"):
-        compare(sample, steep)
-    with pytest.raises(RuntimeError, match="this is a bug"):
-        compare(sample, lambda obs, memory, mask: (sample.action, sample.outputs + 1, sample.after))

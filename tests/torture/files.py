@@ -21,7 +21,6 @@ from typer.testing import CliRunner
 from esp_cli.app import app
 from esp_cli.checking import collect
 from esp_cli.checking.recorded import read_transitions
-from esp_cli.export.export import _refuse_mixture
 from esp_cli.files.documents import DocumentFormat, parse_object
 from esp_cli.policies.bundled import MANIFEST, MANIFEST_FORMAT, Manifest, bundled_folder
 from esp_cli.policies.loading import TrainedPolicy
@@ -188,7 +187,6 @@ def _make_sound_files(scratch: Path) -> None:
     crowd = tiny_folder(scratch / "crowd", steps=100, **{name.replace(".", "__"): x for name, x in many.items()})
     with crowd.lock():
         Trainer(parse_config(crowd.config, crowd.path), crowd).run(lambda news: True)
-    _run_command(["export", str(folder.path), "-f", "numpy", "-o", str(scratch / "export"), "--seed", "0"])
     _run_command(["report", str(study.path), "-o", str(scratch / "page")])
     (scratch / "orders.json").write_text(json.dumps(ORDERS))
     (scratch / "space.toml").write_bytes(SPACE)
@@ -308,10 +306,6 @@ def _results(path: Path) -> None:
     read_results(path)
 
 
-def _export(path: Path) -> None:
-    _refuse_mixture(["numpy"], path.parent)
-
-
 def _tuning(path: Path) -> str | None:
     return _document(TUNING_FORMAT, path, TUNING_FORMAT.parse(path, Tuning).model_dump(mode="json"))
 
@@ -341,7 +335,6 @@ _ALL = (
     ("orders.json", _orders, "train --config {scratch}/orders.json --print-config", spoil_json),
     ("space.toml", _space, "tune --space {scratch}/space.toml --out {scratch}/never --budget 1 --dry-run", spoil_bytes),
     ("page/results.json", _results, "report {scratch}/study -o {scratch}/page", spoil_json),
-    ("export/policy.json", _export, "export {scratch}/run -f c -o {scratch}/export --force --seed 0", spoil_json),
 )
 _NAMES = (
     "policy",
@@ -358,7 +351,6 @@ _NAMES = (
     "orders",
     "space",
     "results",
-    "description",
 )
 KINDS = {
     name: Kind(path, load, tuple(command.split()), spoil)
