@@ -141,8 +141,7 @@ class Spaces:
         count = self.num_agents * len(self.observation.fields)
         starts = range(len(self.state.fields) - count + 1)
         own = joint_layout(self.observation, self.num_agents).fields if starts else ()  # which takes time for many
-        ends = (slice(k, k + count) for k in starts if self.state.fields[k : k + count] == own)
-        return next(ends, None)
+        return next((slice(k, k + count) for k in starts if self.state.fields[k : k + count] == own), None)
 
     @property
     def label(self) -> str:

@@ -108,8 +108,7 @@ class OthersAtRandom:
 
     def step(self, k: int, action: Tensor) -> Step:
         joint = self.image(self.env.random_action())
-        where = self.env.spec.parts[k][1]
-        joint[:, :, where] = joined([action, joint[:, :, :0]])
+        joint[:, :, self.env.spec.parts[k][1]] = joined([action, joint[:, :, :0]])
         return self.env.step(joint)
 
 

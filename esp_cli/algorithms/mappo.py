@@ -282,8 +282,7 @@ class Mappo(Learner):
     def answers(self, rows: Batch) -> Answers:
         """Return what policy and critic say of rows, for `SymmetryPrior.errors`."""
         outputs = self.policy.unroll(rows.obs, action_mask=rows.action_mask)
-        values = self.critic.unroll(rows.obs, rows.state)
-        return {"policy": (self.policy.head, outputs), "value": values}
+        return {"policy": (self.policy.head, outputs), "value": self.critic.unroll(rows.obs, rows.state)}
 
 
 def _add(sums: dict[str, Tensor], weight: float, **values: Tensor) -> None:

@@ -43,8 +43,7 @@ def gae(
         gae_lambda: 0 is one-step temporal difference, 1 Monte Carlo.
     """
     delta = torch.where(terminated, reward, reward + gamma * next_value) - value
-    decay = gamma * gae_lambda * (~ended).to(delta.dtype)
-    return _recursion(delta, decay)
+    return _recursion(delta, gamma * gae_lambda * (~ended).to(delta.dtype))
 
 
 def td_targets(
@@ -88,8 +87,7 @@ def normalise_per_seed(x: Tensor, epsilon: float = 1e-5, valid: Tensor | None = 
         centred = _centred(x, valid)
         deviation = mean_per_seed(centred.square(), valid).sqrt()
         return centred / (beside(deviation, x) + epsilon)
-    axes = tuple(range(1, x.dim()))
-    deviation, mean = torch.std_mean(x, axes, correction=0, keepdim=True)
+    deviation, mean = torch.std_mean(x, tuple(range(1, x.dim())), correction=0, keepdim=True)
     return (x - mean) / (deviation + epsilon)
 
 
@@ -119,12 +117,8 @@ def _variance(x: Tensor, valid: Tensor | None) -> Tensor:
 def ppo_loss(head: Any, outputs: Any, copies: Copies[Any], clip_epsilon: float, entropy_coef: float) -> Loss:
     """Return the negative of the clipped objective (Eq. 3; of copies Eq. 7) and of the weighted entropy.
 
-    Args:
-        head: of a stochastic policy.
-        outputs: [S, B (1 + copies), T, N, ...] of the policy for all rows.
-        copies: of what was done; the ratio is rho = pi(K_g a given L_g s) / exp(log_prob).
-        clip_epsilon: of the ratio's clip.
-        entropy_coef: weight of the entropy.
+    The policy's outputs [S, B (1 + copies), T, N, ...] are for all rows; the ratio that is clipped to 1 +-
+    `clip_epsilon` is rho = pi(K_g a given L_g s) / exp(log_prob).
     """
     batch, learned = copies.originals, copies.learned
     old_log_prob = copies.in_frame("log_prob")
@@ -160,15 +154,11 @@ def clipped_surrogate(log_ratio: Tensor, advantage: Tensor, clip_epsilon: float)
 def value_loss(
     values: Any, target: Tensor, copies: Copies[Any], huber_delta: float, clip_epsilon: float | None = None
 ) -> Loss:
-    """Return the Huber loss of values (Eq. 4), or of action values: L_TD.
+    """Return the Huber loss, linear from `huber_delta` on, of values (Eq. 4), or of action values: L_TD.
 
-    Args:
-        values: [S, B (1 + copies), T, C] for all rows.
-        target: [S, B, T, C] of the originals, which a copy shares (Prop. 1).
-        copies: of the batch.
-        huber_delta: where the loss becomes linear.
-        clip_epsilon: where given, the larger of this loss and that of V_old + clip(V - V_old, -eps, eps), as in the
-            MAPPO paper.
+    values [S, B (1 + copies), T, C] are of all rows, target [S, B, T, C] of the originals, which a copy shares (Prop.
+    1). With `clip_epsilon` it is the larger of this loss and that of V_old + clip(V - V_old, -eps, eps), as in the
+    MAPPO paper.
     """
     outputs, learned = copies.values(values), copies.learned
     mask = copies.originals.valued(outputs.count)

@@ -32,8 +32,7 @@ def new_policy(cls: type[Learner], spec: TaskSpec, network: NetworkConfig, gener
 class RolesLearner(Learner):
     """An ordinary learner for each role, which acts in that role's view of the worlds; see `Lockstep`.
 
-    A tensor of the state is named "critic.ROLE.weight", a metric "train/ROLE/entropy". Where a role has one agent, its
-    prior leaves orders of agents out.
+    A tensor is named "critic.ROLE.weight", a metric "train/ROLE/entropy". A role of one agent has no orders of agents.
     """
 
     def __init__(

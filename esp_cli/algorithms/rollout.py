@@ -120,8 +120,7 @@ class Collector:
         self.finished_count += ended.sum(1)
         self.episode_return = torch.where(ended, 0.0, self.episode_return)
         if self.memory.shape[-1]:
-            keep = (~ended).repeat_interleave(self.env.spec.num_agents, 1).unsqueeze(-1)
-            self.memory = self.memory * keep
+            self.memory = self.memory * (~ended).repeat_interleave(self.env.spec.num_agents, 1).unsqueeze(-1)
 
     def pop_mean_return(self) -> Tensor:
         """Return the mean return [S] of episodes finished since the last call (NaN where none was)."""
@@ -187,8 +186,7 @@ def values_along(
 
 def _episodes(rows: Tensor, finals: list[Tensor], length: int) -> Tensor:
     """Cut [S, E, T, ...] into whole episodes, each with its final row behind it: [S, E * k, length + 1, ...]."""
-    episodes = rows.unflatten(2, (-1, length))
-    return torch.cat([episodes, torch.stack(finals, 2).unsqueeze(3)], 3).flatten(1, 2)
+    return torch.cat([rows.unflatten(2, (-1, length)), torch.stack(finals, 2).unsqueeze(3)], 3).flatten(1, 2)
 
 
 def _value_of(critic: Critic, observation: Observation) -> Tensor:

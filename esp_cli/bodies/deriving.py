@@ -146,8 +146,7 @@ def _state_maps(frame: Frame, R: Floats, joints: dict[int, int]) -> tuple[Floats
         turn = _times(model.qpos0[into][3:]) @ block_diag(1, det * R) @ _times(model.qpos0[out][3:] * [1, -1, -1, -1])
         qpos[into, out], qvel[into_v, out_v] = block_diag(R, turn), block_diag(R, det * local)
         fixed[out][:3], moved[into][:3] = frame.centre, frame.centre
-    offset = moved - qpos @ fixed
-    return clean(qpos), clean(offset), clean(qvel)
+    return clean(qpos), clean(moved - qpos @ fixed), clean(qvel)
 
 
 def _times(q: Floats) -> Floats:

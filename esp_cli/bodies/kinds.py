@@ -96,8 +96,7 @@ def parts_field(name: str, what: str, parts: Sequence[str], moves: Mapping[Plane
     if not parts:
         raise UserError(f"field '{name}' has no {what}; name some")
     rows = tuple((element, tuple(map(tuple, matrix.tolist()))) for element, matrix in moves.items())
-    kind = PartsKind(what, len(parts), parts=tuple(parts), moves=rows)
-    return Field(name, kind, count)
+    return Field(name, PartsKind(what, len(parts), parts=tuple(parts), moves=rows), count)
 
 
 def points_field(
@@ -173,8 +172,7 @@ class Parts:
 def named_parts(what: str, names: Sequence[str], tables: Mapping[str, Any]) -> Parts:
     """Return parts of one number each, with what tables of names say, and their products.
 
-    A table holds by part its image, with "-" where the sign changes; or there are such tables by element. What is left
-    out of a table follows from its partner.
+    A table, or one by element, holds by part its image, with "-" where the sign changes, or follows from its partner.
     """
     if tables and all(isinstance(value, str) for value in tables.values()):
         tables = {"left-right": tables}

@@ -30,8 +30,7 @@ Numbers = dict[str, Layout]  # layouts of the groups of an observation, by name,
 def numbers_of(body: Body, order: str | None) -> Numbers:
     """Return what a function "module:function" says, or the numbers of Isaac Lab's velocity tasks.
 
-    `order` is that function, or a file of joint names in the simulator's order, one a line; by default the model's
-    order.
+    `order` is that function, or a file of joint names in the simulator's order, one a line; else it is the model's.
     """
     if order is None or ":" not in order or Path(order).exists():
         names = None if order is None else _lines(Path(order))

@@ -36,8 +36,7 @@ def layouts_of(
     """Return the layouts of an environment whose observations are numbers of its simulator.
 
     Distinct numbers are written into `data`, which is overwritten, and looked for in what each agent sees without a
-    step, `observe`: `lambda: [env.unwrapped._get_obs()]`. `acting` are each agent's actuators, in order; by default one
-    has all.
+    step: `lambda: [env.unwrapped._get_obs()]`. `acting` are each agent's actuators, in order; by default one has all.
     """
     acts = [np.array(one) for one in acting or [range(data.model.nu)]]
     names, seen = _names(body, data.model), _sources(data, observe)

@@ -42,10 +42,9 @@ class Turning:
 
 
 def turning(actor: Actor, body: Body, numbers: Numbers, rows: Floats | None = None) -> list[Turning]:
-    """Compare what a policy does in states and in their images.
+    """Compare what a policy does in states and in their images, by default normal ones with quaternions of length 1.
 
-    The actor takes rows [M, D] of the first group of observations to actions [M, A]. By default rows are normal ones,
-    quaternions and gravity of length 1.
+    The actor takes rows [M, D] of the first group of observations to actions [M, A].
     """
     seen = numbers[next((name for name in numbers if name != ACTION), ACTION)]
     rows = _drawn(seen) if rows is None else rows

@@ -32,9 +32,9 @@ class NothingToTry(UserError):  # noqa: N818
 def candidates(spaces: Spaces, transforms: str | None = None) -> list[Element]:
     """Return the elements to try: those asked for, else of polygons, any angle, exchanges of two agents or like items.
 
-    Elements that the actions or layouts cannot carry are left out, and those that move no number of the task; where
-    none is left, that is `NothingToTry`. Of the default ones that move all numbers alike, as two mirrors that no vector
-    sees, the first stands for all.
+    Elements that the actions or layouts cannot carry are left out, and those that move no number; where none is left,
+    that is `NothingToTry`. Of default ones that move all numbers alike, as two mirrors that no vector sees, the first
+    stands for all.
     """
     texts = [transforms] if transforms is not None else _defaults(spaces)
     refusals = _refusals(texts, spaces)

@@ -58,10 +58,9 @@ def planes(layout: Layout, obs: Tensor) -> list[list[int]]:
 
 
 class Controls:
-    """Functions of what an agent sees, and of who it is, that most elements change.
+    """Functions of what an agent sees that most elements change, each of mean 0 and variance 1.
 
-    Each has mean 0 and variance 1, and is of one of seven shapes in one vector, turned by any angle; or it says which
-    agent it is.
+    Each is of one of seven shapes in one vector, turned by any angle; or it says which agent it is.
     """
 
     def __init__(self, layout: Layout, data: Transitions) -> None:
@@ -87,8 +86,7 @@ class Controls:
 def strength(function: Tensor, image: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Return the mean squared change [functions] of each function [M, T, N, functions] by an element, and which count.
 
-    The functions are carried along with the transitions to their images; `image` are those of the images, `weight` [M,
-    T, N, 1] is of each step.
+    The functions move along with the transitions to images, of which `image` are theirs; weights [M, T, N, 1] of steps.
     """
     size = (weight * (image - function).square()).mean((0, 1, 2))
     return size.clamp_min(_FEWEST), size > _FEWEST

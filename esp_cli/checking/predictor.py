@@ -72,8 +72,7 @@ class Predictor:
         return torch.linalg.solve(gram + held, cross).float()[0]
 
     def _linear(self, data: Transitions) -> Tensor:
-        count = len(data.obs)
-        parts = (data.episodes(slice(start, start + _CHUNK)) for start in range(0, count, _CHUNK))
+        parts = (data.episodes(slice(start, start + _CHUNK)) for start in range(0, len(data.obs), _CHUNK))
         return torch.cat([self._features(part) @ self._weights for part in parts])
 
     def _features(self, data: Transitions) -> Tensor:

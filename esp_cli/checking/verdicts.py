@@ -99,8 +99,7 @@ def verdicts_of(
 ) -> list[ElementVerdict]:
     """Judge elements, declared ones first, and tell how many of how many are done.
 
-    `until` is the reading of `time.monotonic` from which on an element is not tried and so not covered, `spare` the
-    same for elements that nobody declared.
+    At `until` of `time.monotonic` the rest is not tried and so not covered, at `spare` what nobody declared.
     """
     found = dict[Named, ElementVerdict]()
     for done, element in enumerate(sorted(elements, key=lambda one: not is_declared(one)), 1):

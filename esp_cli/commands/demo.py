@@ -91,8 +91,7 @@ class LiveCurves(StudyProgress):
         super().update(snapshot)
         curves = {cell.variant: self._points(cell) for cell in self._folder.study.cells}
         if self._live is not None:
-            steps = self._folder.study.cells[0].config.steps
-            self._live.above = draw_curves(curves, steps, console.err.width)
+            self._live.above = draw_curves(curves, self._folder.study.cells[0].config.steps, console.err.width)
             return
         both = list(zip(*curves.values(), strict=False))
         for points in both[self._told :]:

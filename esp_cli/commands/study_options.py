@@ -43,8 +43,7 @@ def parse_names(items: Sequence[str] | None, known: Collection[str] = ()) -> tup
     for item in items or ():
         parts = [part.strip() for part in item.split(",") if part.strip()]
         while parts:
-            fits = (k for k in range(len(parts), 1, -1) if ", ".join(parts[:k]) in known)
-            end = next(fits, 1)
+            end = next((k for k in range(len(parts), 1, -1) if ", ".join(parts[:k]) in known), 1)
             names.append(", ".join(parts[:end]))
             del parts[:end]
     if items and not names:

@@ -53,8 +53,7 @@ def take_scenes(trained: TrainedPolicy, count: int = STATES) -> Scenes:
         for _ in range(5):
             action, memory = trained.policy.act(observation.obs, memory)
             observation = played.step(action).next
-    stacked = (np.concatenate(arrays)[:count] for arrays in zip(*parts, strict=True))
-    return Scenes(*stacked)
+    return Scenes(*(np.concatenate(arrays)[:count] for arrays in zip(*parts, strict=True)))
 
 
 def _probe(env: Environment, state: Floats, rng: np.random.Generator, near: bool) -> tuple[Floats, ...]:

@@ -61,8 +61,7 @@ class SharedCriticInput:
 class PerAgentCriticInput(SharedCriticInput):
     """One value per agent, for agents with their own rewards: one shared critic sees a scene once per agent.
 
-    The row of an agent lists all agents in circular order and ends with that agent. Beside a global state, the critic
-    sees that agent's observation.
+    A row lists all agents in circular order, its own the last. Beside a global state, the critic sees its observation.
     """
 
     @property

@@ -56,8 +56,7 @@ class SeedMLP(nn.Module):
     Without layer normalisation forward and backward run through one hand-written function (`perceptron`) that keeps
     only the activations and works in place; with it, through torch's own layers. It normalises the input and every
     hidden activation, as the MAPPO paper's code does. `output_gain` is the orthogonal gain of the last layer (0.01 for
-    a policy head, 1 for a value). `precision` is of the matrix products; parameters, inputs, outputs and parameter
-    gradients stay float32.
+    a policy head, 1 for a value). `precision` is of matrix products; all that goes in and out stays float32.
     """
 
     def __init__(
@@ -72,8 +71,7 @@ class SeedMLP(nn.Module):
         compiled: bool = False,
     ) -> None:
         super().__init__()
-        hidden_gain = GAINS[activation]
-        gains = [hidden_gain] * (len(sizes) - 2) + [output_gain]
+        gains = [GAINS[activation]] * (len(sizes) - 2) + [output_gain]
         self.layers = nn.ModuleList(
             SeedLinear(generators, a, b, gain) for a, b, gain in zip(sizes[:-1], sizes[1:], gains, strict=True)
         )

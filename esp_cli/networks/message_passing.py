@@ -215,8 +215,7 @@ class MessagePassing(Memoryless):
 
     def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
         worlds = x.unflatten(1, (-1, self.team)).transpose(2, 3)  # [S, W, T, N, D]
-        outputs = self(worlds.flatten(1, 3)).unflatten(1, worlds.shape[1:4])
-        return outputs.transpose(2, 3).flatten(1, 2)
+        return self(worlds.flatten(1, 3)).unflatten(1, worlds.shape[1:4]).transpose(2, 3).flatten(1, 2)
 
 
 def _fields(io: IoSpec) -> tuple[Field, Field]:

@@ -59,8 +59,7 @@ class Policies(ABC):
 class CategoricalPolicies(Policies):
     """Choices among A actions with probabilities softmax(outputs), actions first; see `Categorical.normalise`.
 
-    A slope is by the log-probabilities [S, A, P, R], up to a multiple of the probabilities, which the softmax takes
-    away.
+    A slope is by log-probabilities [S, A, P, R], up to a multiple of the probabilities: the softmax takes it away.
     """
 
     def __init__(self, outputs: WithVJP, frame: Frame) -> None:
@@ -164,8 +163,8 @@ def _beside(weights: Weights) -> Weights:
 class GaussianPolicies(Policies):
     """Gaussians whose means are the outputs, with one log deviation of each item for all rows.
 
-    An item that changes places in a copy has the deviation of its place there. A slope is that by the means
-    [S, P, R, W] and that by the log deviations [S, items].
+    An item moved by a copy has the deviation of its new place. Slopes are by means [S, P, R, W] and deviations [S,
+    items].
     """
 
     def __init__(self, outputs: WithVJP, frame: Frame, log_std: Tensor, item: Tensor) -> None:

@@ -166,8 +166,7 @@ class Critic(nn.Module):
     """S critics of one shape.
 
     It reads the global "state" or all agents' "observations" in a row and returns one value for a shared reward, else
-    one per agent; or it reads each agent's "own" observation and returns that agent's value, with weights that all
-    share.
+    one per agent; or it reads each agent's "own" observation and returns its value, with weights that all share.
     """
 
     def __init__(

@@ -74,8 +74,7 @@ def _columns(fields: Sequence[Field]) -> tuple[list[int], list[int]]:
 class InvariantRows(Rows):
     """Splits rows into numbers that neither turns nor mirrors change; see `Rows`.
 
-    With A directions, a row becomes A rows that also have each vector's component along one of them, and whether it is
-    one: [S, B, .] to [S, B A, .].
+    With A directions [S, B, .] become [S, B A, .], with each vector's component along one, and whether it is one.
     """
 
     def __init__(
@@ -194,6 +193,5 @@ class ForceActor(Memoryless):
             if of:
                 mine = _picked(numbers, of)
                 scores = next(layers)(features.flatten(1, 2)).view(*mine.shape[:3], _SUMS, len(of))
-                sums = torch.einsum("sbkcv,sbkvd->sbcvd", scores.softmax(2), mine)
-                vectors.append(sums.flatten(2, 3))
+                vectors.append(torch.einsum("sbkcv,sbkvd->sbcvd", scores.softmax(2), mine).flatten(2, 3))
         return parts, torch.cat(vectors, 2)

@@ -53,8 +53,7 @@ class Symmetrised(Network):
         return self._mean(y), apart.unflatten(1, (order, -1)).permute(0, 2, 1, 3).flatten(2)
 
     def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
-        shape = (self.group.order * x.shape[1], x.shape[2])
-        images = self._images(x.flatten(1, 2)).unflatten(1, shape)
+        images = self._images(x.flatten(1, 2)).unflatten(1, (self.group.order * x.shape[1], x.shape[2]))
         return self._mean(self.network.unroll(images, truncation).flatten(1, 2)).unflatten(1, x.shape[1:3])
 
 
@@ -105,8 +104,7 @@ def action_parts(space: ActionSpace) -> Tensor:
         values = [sorted(set(column)) for column in columns]
         if len(values) > 1 and math.prod(map(len, values)) == space.count:
             parts = [(column, value) for column, choices in zip(columns, values, strict=True) for value in choices]
-            has = [[x == value for x in column] for column, value in parts]
-            return torch.tensor(has, dtype=torch.float32)
+            return torch.tensor([[x == value for x in column] for column, value in parts], dtype=torch.float32)
     raise UserError(
         "network.separate_parts is for discrete actions that are all combinations of part values, "
         "such as pairs of wheel speeds; leave it off"

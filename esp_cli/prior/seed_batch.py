@@ -92,8 +92,7 @@ class SeedBatch:
 def mean_per_seed(x: Tensor, mask: Tensor | None = None) -> Tensor:
     """Return the mean [S] of x [S, B, T, ...] (without a mask [S, ...]) over what counts; 0 where nothing does.
 
-    The mask [S, B, T] says which rows count, or [S, B, T, N] which agents. A number per world, x [S, B, T, 1], counts
-    while an agent of the world does.
+    The mask [S, B, T(, N)] is of rows or agents. A number per world, x [S, B, T, 1], counts while an agent of it does.
     """
     if mask is None:
         return x.flatten(1).mean(1)

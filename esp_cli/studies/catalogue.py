@@ -95,8 +95,7 @@ def _pairs(
     ):
         stem = f"{file_name(team.label)}-{format_exactly(steps)}-{file_name(algorithm)}"
         for prior in variants:
-            settings = {**team.settings, **kind.variants[prior]}
-            config = _config(kind, task, algorithm, steps, request, settings)
+            config = _config(kind, task, algorithm, steps, request, {**team.settings, **kind.variants[prior]})
             yield Cell(
                 name=f"{stem}-{'plain' if prior == 'none' else prior}",
                 panel=f"{team.label}, {format_exactly(steps)}",

@@ -122,8 +122,7 @@ class LocalJob:
 def follow_parent() -> None:
     """Let this process stop cleanly when the one that started it ends; for the jobs of a LocalEngine.
 
-    Where the operating system does not tell of that (Linux does), the process goes on to its own end; a study that is
-    started again meanwhile waits for it.
+    Only Linux tells; elsewhere it goes on to its own end, and a study that is started again waits for it.
     """
     parent = os.environ.get(_PARENT)
     if parent is None or sys.platform != "linux":

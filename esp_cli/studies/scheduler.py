@@ -102,8 +102,7 @@ class Scheduler:
         if any(seconds is None for _, seconds in costs):
             return None
         running = [seconds or 0.0 for run, seconds in costs if run.is_active]
-        waiting = [seconds or 0.0 for run, seconds in costs if not run.is_active]
-        return makespan(running, waiting, self.jobs)
+        return makespan(running, [seconds or 0.0 for run, seconds in costs if not run.is_active], self.jobs)
 
     def _seconds_left(self, run: Run) -> float | None:
         """Estimate what is left of a run by its own speed, or by that of runs like it."""

@@ -41,8 +41,7 @@ _STACK_LIMIT = 512  # most elements that are built once; of more (d4*agents with
 class Transform:
     """One element per seed, on data [S, ...]. A single element acts on any leading axes: [B, ...] or [S, B, ...].
 
-    Where agents stay in their places, rows may come without an agent axis. Results are new tensors, and gradients flow
-    through.
+    Where agents stay in their places, rows may come without an agent axis. Results are new, and gradients flow through.
     """
 
     elements: tuple[Element, ...]  # the element of each seed

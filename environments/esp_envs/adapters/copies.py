@@ -36,11 +36,10 @@ class Board:
     """Arrays of C copies of a task and M metrics, in memory that a fork of this process shares.
 
     cut [C] uint8: which copies reach the horizon with the next step. ended [C] uint8: 0 or how the episode ended in the
-    last step. seed [C] int64: of the next start. action: [C, N] int64 or [C, N, width] float32. reward [C, N] and
-    metrics [C, M]: float32. Of the next four arrays `NOW` is what is seen now, and `FINAL` what was seen before the
-    automatic reset; the two are the same unless the episode ended. obs [2, C, N, D] and state [2, C, state width]:
-    float32. mask [2, C, N, A] uint8: the allowed actions; A = 0 without masks. alive [2, C, N] uint8: the agents that
-    have not ended.
+    last step. seed [C] int64: of the next start. action [C, N] int64 or [C, N, width] float32; reward [C, N] and
+    metrics [C, M] float32. Of the others `NOW` is what is seen now, `FINAL` what was seen before the automatic reset,
+    the same unless the episode ended: obs [2, C, N, D] and state [2, C, state width] float32, mask [2, C, N, A] uint8
+    of allowed actions (A = 0 without masks), alive [2, C, N] uint8 of agents that have not ended.
     """
 
     def __init__(self, spec: TaskSpec, copies: int, metrics: int) -> None:

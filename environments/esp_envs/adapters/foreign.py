@@ -55,8 +55,7 @@ def _kind(env: Any, wanted: str) -> str:
 class ByAgent:
     """A Gymnasium environment as a PettingZoo `ParallelEnv`, as far as the adapter needs one.
 
-    Agents are entries of Tuple spaces and lists, as in level-based foraging: "agent_0" and so on; one `alone` is
-    "agent".
+    Agents are entries of Tuple spaces and lists, as in level-based foraging: "agent_0" and so on, or "agent" `alone`.
     """
 
     def __init__(self, env: Any, alone: bool = True) -> None:

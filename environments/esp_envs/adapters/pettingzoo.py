@@ -69,8 +69,7 @@ class ParallelTask(CopyHooks, Environment):
         one.close()
         self._copies: CopyStepper | WorkerCopies | None = None
         self._simulated = False
-        lead = (self.num_seeds, num_envs)
-        self._base = torch.zeros(lead, dtype=torch.int64)
+        self._base = torch.zeros((self.num_seeds, num_envs), dtype=torch.int64)
         self._begun, self._time = torch.zeros_like(self._base), torch.zeros_like(self._base)
 
     def _require_kind(self, name: str, kind: Any) -> None:

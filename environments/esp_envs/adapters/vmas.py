@@ -216,8 +216,7 @@ class VmasTask(Environment):
         return joined(parts)
 
     def _look(self, sim: Any, obs: Sequence[Tensor]) -> Observation:
-        seen = self.reading(self._rows(obs))
-        return Observation(seen.unsqueeze(0), self._entities.read(sim).unsqueeze(0))
+        return Observation(self.reading(self._rows(obs)).unsqueeze(0), self._entities.read(sim).unsqueeze(0))
 
 
 def _joined(parts: Sequence[Observation]) -> Observation:

@@ -64,8 +64,7 @@ def towards(wish: Array, heading: Array, control_period_s: float) -> Array:
 def give_way(to_goal: Array, to_bodies: Array, gaps: Array) -> Array:
     """Return the way [W, N, 2] that keeps clear of near bodies: away from them, and past them on the right.
 
-    `to_bodies` [W, N, B, 2] leads to the centre of every other body, m; `gaps` [W, N, B] are between surfaces, m, and
-    infinite for a robot and itself.
+    `to_bodies` [W, N, B, 2] leads to their centres, m; `gaps` [W, N, B] between surfaces, m, are infinite for oneself.
     """
     near = np.maximum(1 - np.maximum(gaps, 0) / SIGHT_M, 0)
     away = -to_bodies / np.maximum(length(to_bodies), 1e-9)[..., None]

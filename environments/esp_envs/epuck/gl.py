@@ -41,8 +41,7 @@ def is_installed(backend: str) -> bool:
 def forget_missing_backend() -> None:
     """Take MUJOCO_GL out of the environment where the library that it names is missing, before MuJoCo is imported.
 
-    Its import fails otherwise ("'NoneType' object has no attribute 'glGetError'"), even for training, which draws
-    nothing.
+    Its import fails otherwise ("'NoneType' object has no attribute 'glGetError'"), even where nothing is drawn.
     """
     named = os.environ.get("MUJOCO_GL", "").strip().lower()
     known = _OF_SYSTEM.get(sys.platform, ())

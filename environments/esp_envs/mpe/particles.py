@@ -62,15 +62,12 @@ class Bodies:
 class ParticleWorlds:
     """W worlds of the same bodies.
 
-    Attributes:
-        physics: [2A + L, 2, W'] float32; rows are the agents' velocities, the agents' positions, the landmarks'
-            positions; W' is W padded up (see LANE_MULTIPLE). `velocity`, `position` and `entity` are views of it.
-        squared_contact_distance: [contacts, W'] of the pairs in `bodies.contacts`, for the present positions.
-        squared_watched_distance: [watched, W'] of the pairs in `bodies.watched`.
-        pushes: [A, contacts] 1 and -1 where an agent is the first or the second of a pair.
-
-    All of these stay the same memory for good, so that a task may keep views of them. Code that writes to
-    `physics` calls `measure` afterwards.
+    `physics` [2A + L, 2, W'] float32 has rows of the agents' velocities, the agents' positions, the landmarks'
+    positions, of which `velocity`, `position` and `entity` are views; W' is W padded up (see LANE_MULTIPLE). Code that
+    writes to it calls `measure` afterwards, for `squared_contact_distance` [contacts, W'] and
+    `squared_watched_distance` [watched, W'] of the pairs in `bodies`. `pushes` [A, contacts] are 1 and -1 where an
+    agent is the first or the second of a pair. All of these stay the same memory for good, so that a task may keep
+    views of them.
     """
 
     def __init__(self, bodies: Bodies, num_worlds: int, device: torch.device, velocity_first: bool = True) -> None:
@@ -112,11 +109,10 @@ class ParticleWorlds:
         torch.add(self._square[:, 0], self._square[:, 1], out=self._squared_distance)
 
     def advance(self, control: Tensor, push: Tensor | None = None, mud: float = 0.0) -> None:
-        """Advance all worlds by DT_S.
+        """Advance all worlds by DT_S, with controls [A, 2, W'] in units of an agent's gain, normally of length <= 1.
 
-        Controls [A, 2, W'] are in units of an agent's gain, normally of length <= 1. `push` [A, 2, W' or 1] is an
-        acceleration that nobody wishes for, length / s^2, and `mud` the share of velocity that a step costs more where
-        x > 0.
+        `push` [A, 2, W' or 1] is an acceleration that nobody wishes for, length / s^2, and `mud` the share of velocity
+        that a step costs more where x > 0.
         """
         held = 1 - mud * (self.position[:, :1] > 0).float() if mud else None
         contact = self._contact_impulses()

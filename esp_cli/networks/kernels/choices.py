@@ -91,8 +91,7 @@ class Slope(NamedTuple):
         orders = orders.contiguous()
         (num_seeds, num_parts, num_actions), num_rows = orders.shape, run.num_rows
         sizes = (num_seeds, num_parts, num_rows, num_actions)
-        choices = _Choices(*sizes, orders=orders.data_ptr())
-        return run.learn("choices", "learn_choices", choices, self.asked())
+        return run.learn("choices", "learn_choices", _Choices(*sizes, orders=orders.data_ptr()), self.asked())
 
 
 class CompiledChoices:

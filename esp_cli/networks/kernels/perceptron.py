@@ -207,8 +207,7 @@ class CompiledPass:
 class LearningPass(CompiledPass):
     """A pass whose outputs a kernel turns into the slope of a loss at once, block by block; they are kept nowhere.
 
-    The rows are [S, R, parts, in], of which the parts of a row stay together; the perceptron ends without an
-    activation.
+    The parts of a row of [S, R, parts, in] stay together; the perceptron ends without an activation.
     """
 
     computes_again = True

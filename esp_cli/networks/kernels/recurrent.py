@@ -26,8 +26,7 @@ class _Unit(ctypes.Structure):
 class CompiledUnroll:
     """A run through whole episodes x [S, T, B, in] from empty memory; `memories` are [S, T, B, H] after every step.
 
-    The parameters are W [S, in, 3H] and its bias [S, 1, 3H], U [S, H, 3H] and its bias. There is a `backward` where
-    `keep` asks for one.
+    The parameters are W [S, in, 3H], its bias [S, 1, 3H], U [S, H, 3H] and its bias. To `keep` adds a `backward`.
     """
 
     @torch.no_grad()
