@@ -6,14 +6,13 @@ A network is one file, with its class and its `NetworkConfig`. The settings are 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Annotated
 
-import torch
 from pydantic import BeforeValidator, SerializeAsAny
 
 from esp_cli.files.documents import validate
-from esp_cli.networks.contract import ActivationName, IoSpec, Network, NetworkConfig
+from esp_cli.networks.contract import ActivationName, Generators, IoSpec, Network, NetworkConfig
 from esp_cli.networks.plain import MlpConfig, PlainConfig
 from esp_cli.networks.symmetrised import LOCAL, LocalFrame, Symmetrised
 from esp_envs.errors import UserError
@@ -70,7 +69,7 @@ def perceptron(config: NetworkConfig, activation: ActivationName) -> MlpConfig:
 
 
 def build_network(
-    generators: Sequence[torch.Generator],
+    generators: Generators,
     inputs: int,
     outputs: int,
     config: NetworkConfig,

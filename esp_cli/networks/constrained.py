@@ -11,7 +11,7 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from esp_cli.networks.contract import VJP, ActivationName, IoSpec, Memoryless, Network, NetworkConfig
+from esp_cli.networks.contract import VJP, ActivationName, Generators, IoSpec, Memoryless, Network, NetworkConfig
 from esp_cli.networks.layers import GAINS, SeedMLP, orthogonal
 from esp_cli.networks.perceptron import Shape, affine, perceptron, perceptron_with_vjp
 from esp_cli.symmetry import FiniteGroup
@@ -51,7 +51,7 @@ class ConstrainedLinear(nn.Module):
 
     def __init__(
         self,
-        generators: Sequence[torch.Generator],
+        generators: Generators,
         inputs: Sequence[Block],
         outputs: Sequence[Block],
         gain: float,
@@ -150,7 +150,7 @@ class EquivariantConfig(NetworkConfig):
         return frozenset() if self.relax else frozenset({"relaxation"})
 
     def build(
-        self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
+        self, generators: Generators, inputs: int, outputs: int, output_gain: float, io: IoSpec | None
     ) -> Network:
         if not self.relax or self.relaxation != "gate":
             return Equivariant(generators, self.io_or_refuse(io), self, output_gain)
@@ -165,9 +165,7 @@ class EquivariantConfig(NetworkConfig):
 class Equivariant(Memoryless):
     """A perceptron of regular features over scalars, planar vectors and the like: equivariant in every layer."""
 
-    def __init__(
-        self, generators: Sequence[torch.Generator], io: IoSpec, config: EquivariantConfig, output_gain: float
-    ) -> None:
+    def __init__(self, generators: Generators, io: IoSpec, config: EquivariantConfig, output_gain: float) -> None:
         super().__init__()
         if any(field.pixels is not None for field in io.layout.fields):
             raise UserError(

@@ -18,6 +18,7 @@ from esp_cli.symmetry.maps import Block, action_blocks, layout_blocks, trivial
 from esp_envs.errors import UserError
 from esp_envs.spec import Layout, Spaces, joint_layout
 
+Generators = Sequence[torch.Generator]  # one per seed
 Reads = Literal["state", "observations", "own"]
 
 
@@ -83,7 +84,7 @@ class NetworkConfig(Strict, ABC):
 
     @abstractmethod
     def build(
-        self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
+        self, generators: Generators, inputs: int, outputs: int, output_gain: float, io: IoSpec | None
     ) -> Network:
         """Build the network, without the average that `symmetrise` asks for; arguments as of `build_network`.
 
@@ -91,9 +92,7 @@ class NetworkConfig(Strict, ABC):
             UserError: the network does not fit `io`, or needs it and there is none.
         """
 
-    def joint_critic(
-        self, generators: Sequence[torch.Generator], io: IoSpec, actions: int, further: int
-    ) -> nn.Module | None:
+    def joint_critic(self, generators: Generators, io: IoSpec, actions: int, further: int) -> nn.Module | None:
         """Build a critic of joint actions of agents that share their reward, as MADDPG has it; None for a perceptron.
 
         Args:
@@ -107,7 +106,7 @@ class NetworkConfig(Strict, ABC):
         """
         return None
 
-    def mixer(self, generators: Sequence[torch.Generator], io: IoSpec, width: int, further: int) -> nn.Module | None:
+    def mixer(self, generators: Generators, io: IoSpec, width: int, further: int) -> nn.Module | None:
         """Build QMIX's mixer; None for weights by a hypernetwork from one row. Arguments as of `joint_critic`.
 
         Returns:

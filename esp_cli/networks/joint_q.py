@@ -5,7 +5,6 @@ Shape letters: S seeds, W agents' scenes (any axes), N agents, C values (1 or N)
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -13,6 +12,7 @@ from torch import Tensor, nn
 from torch.autograd import Function
 from torch.nn.functional import elu
 
+from esp_cli.networks.contract import Generators
 from esp_cli.networks.kernels.library import begin, computes
 from esp_cli.networks.kernels.mixer import CompiledMixer
 from esp_cli.networks.layers import SeedLinear, SeedMLP
@@ -140,13 +140,7 @@ class MonotonicMixer(nn.Module):
     """
 
     def __init__(
-        self,
-        generators: Sequence[torch.Generator],
-        num_agents: int,
-        state_width: int,
-        width: int,
-        hidden: int,
-        compiled: bool = False,
+        self, generators: Generators, num_agents: int, state_width: int, width: int, hidden: int, compiled: bool = False
     ) -> None:
         super().__init__()
         self.num_agents, self.width = num_agents, width

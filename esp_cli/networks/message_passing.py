@@ -9,7 +9,6 @@ values, permuted actions.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -18,7 +17,7 @@ from torch import Tensor, nn
 from torch.autograd import Function
 
 from esp_cli.networks.constrained import ConstrainedLinear, copies_for
-from esp_cli.networks.contract import IoSpec, Memoryless, Network, NetworkConfig
+from esp_cli.networks.contract import Generators, IoSpec, Memoryless, Network, NetworkConfig
 from esp_cli.networks.layers import GAINS
 from esp_cli.networks.perceptron import affine
 from esp_cli.symmetry import FiniteGroup
@@ -37,7 +36,7 @@ _LOT = 16  # the number of encoded pictures is a multiple of this, so that few s
 class PictureEncoder(nn.Module):
     """Convolutions for S seeds, each before a relu, then a maximum over places: [S, B, pixels] -> [S, B, width]."""
 
-    def __init__(self, generators: Sequence[torch.Generator], field: Field, group: FiniteGroup) -> None:
+    def __init__(self, generators: Generators, field: Field, group: FiniteGroup) -> None:
         super().__init__()
         assert field.pixels is not None
         self.shape = (field.count, *field.pixels)
@@ -138,7 +137,7 @@ class MpnConfig(NetworkConfig):
     name: Literal["mpn"] = "mpn"
 
     def build(
-        self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
+        self, generators: Generators, inputs: int, outputs: int, output_gain: float, io: IoSpec | None
     ) -> Network:
         return MessagePassing(generators, self.io_or_refuse(io), self, "c1", output_gain)
 
@@ -150,7 +149,7 @@ class EmpnConfig(NetworkConfig):
     group: str = Setting("c4", max_length=100, description="the layers commute with this group")
 
     def build(
-        self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
+        self, generators: Generators, inputs: int, outputs: int, output_gain: float, io: IoSpec | None
     ) -> Network:
         return MessagePassing(generators, self.io_or_refuse(io), self, self.group, output_gain)
 
@@ -163,7 +162,7 @@ class MessagePassing(Memoryless):
     """
 
     def __init__(
-        self, generators: Sequence[torch.Generator], io: IoSpec, config: NetworkConfig, group: str, output_gain: float
+        self, generators: Generators, io: IoSpec, config: NetworkConfig, group: str, output_gain: float
     ) -> None:
         super().__init__()
         if io.reads != "own":

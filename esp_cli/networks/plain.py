@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import pairwise
 from typing import ClassVar, Literal
 
@@ -10,7 +9,7 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from esp_cli.networks.contract import VJP, ActivationName, IoSpec, Memoryless, Network, NetworkConfig
+from esp_cli.networks.contract import VJP, ActivationName, Generators, IoSpec, Memoryless, Network, NetworkConfig
 from esp_cli.networks.kernels.library import WORTH_COMPILING, has_compiler
 from esp_cli.networks.layers import GAINS, SeedLayerNorm, SeedLinear, SeedMLP
 from esp_cli.networks.ordering import NearestFirst
@@ -88,7 +87,7 @@ class MlpConfig(PlainConfig):
     name: Literal["mlp"] = "mlp"
 
     def build(
-        self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
+        self, generators: Generators, inputs: int, outputs: int, output_gain: float, io: IoSpec | None
     ) -> Network:
         return self.ordered(MLP(generators, inputs, outputs, self, output_gain), io)
 
@@ -101,7 +100,7 @@ class GruConfig(PlainConfig):
     name: Literal["gru"] = "gru"
 
     def build(
-        self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
+        self, generators: Generators, inputs: int, outputs: int, output_gain: float, io: IoSpec | None
     ) -> Network:
         return self.ordered(GRU(generators, inputs, outputs, self, output_gain), io)
 
@@ -110,7 +109,7 @@ class MLP(SeedMLP, Memoryless):
     """A perceptron."""
 
     def __init__(
-        self, generators: Sequence[torch.Generator], inputs: int, outputs: int, config: PlainConfig, output_gain: float
+        self, generators: Generators, inputs: int, outputs: int, config: PlainConfig, output_gain: float
     ) -> None:
         sizes = (inputs, *config.hidden, outputs)
         super().__init__(generators, sizes, config.activation, output_gain, config.layer_norm, False, *config.products)
@@ -126,7 +125,7 @@ class GRU(Network):
     """Hidden layers, a gated recurrent unit, a linear head: the recurrent network of the MAPPO paper."""
 
     def __init__(
-        self, generators: Sequence[torch.Generator], inputs: int, outputs: int, config: PlainConfig, output_gain: float
+        self, generators: Generators, inputs: int, outputs: int, config: PlainConfig, output_gain: float
     ) -> None:
         super().__init__()
         width = config.hidden[-1]

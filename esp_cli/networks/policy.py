@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -10,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from esp_cli.networks.build import build_network
-from esp_cli.networks.contract import IoSpec, Network, NetworkConfig, Reads, WithVJP
+from esp_cli.networks.contract import Generators, IoSpec, Network, NetworkConfig, Reads, WithVJP
 from esp_cli.networks.heads import BoundedGaussian, Categorical, Head, build_head, masked
 from esp_cli.networks.kernels.library import begin
 from esp_cli.networks.plain import PlainConfig
@@ -29,7 +28,7 @@ class Policy(nn.Module):
         self,
         spec: Spaces,
         network: NetworkConfig,
-        generators: Sequence[torch.Generator],
+        generators: Generators,
         head: Head,
         output_gain: float,
         num_extra: int = 0,
@@ -55,7 +54,7 @@ class Policy(nn.Module):
         """Return the memory [S, E * N, H] with which an episode begins."""
         return self.actor.initial_memory(self.num_seeds, num_envs * self.num_agents, like)
 
-    def noise(self, num_envs: int, num_agents: int, generators: Sequence[torch.Generator], device: Any = "cpu") -> Any:
+    def noise(self, num_envs: int, num_agents: int, generators: Generators, device: Any = "cpu") -> Any:
         """Draw what `act` needs to draw actions, per seed from its own generator."""
         return self.head.noise((num_envs, num_agents), generators).to(device)
 
@@ -81,7 +80,7 @@ class StochasticPolicy(Policy):
 
     head: Categorical | BoundedGaussian
 
-    def __init__(self, spec: Spaces, network: NetworkConfig, generators: Sequence[torch.Generator]) -> None:
+    def __init__(self, spec: Spaces, network: NetworkConfig, generators: Generators) -> None:
         super().__init__(spec, network, generators, build_head(spec.action, len(generators)), POLICY_GAIN)
 
     def unroll(self, obs: Tensor, truncation: int = 0, action_mask: Tensor | None = None) -> Tensor:
@@ -110,12 +109,7 @@ class HistoryPolicy(Policy):
     """
 
     def __init__(
-        self,
-        spec: Spaces,
-        network: NetworkConfig,
-        generators: Sequence[torch.Generator],
-        head: Head,
-        output_gain: float,
+        self, spec: Spaces, network: NetworkConfig, generators: Generators, head: Head, output_gain: float
     ) -> None:
         extra = head.num_outputs if network.recurrent else 0
         super().__init__(spec, network, generators, head, output_gain, extra)
@@ -169,9 +163,7 @@ class Critic(nn.Module):
     one per agent; or it reads each agent's "own" observation and returns its value, with weights that all share.
     """
 
-    def __init__(
-        self, spec: TaskSpec, reads: Reads, network: NetworkConfig, generators: Sequence[torch.Generator]
-    ) -> None:
+    def __init__(self, spec: TaskSpec, reads: Reads, network: NetworkConfig, generators: Generators) -> None:
         super().__init__()
         self.reads = reads
         own = reads == "own"

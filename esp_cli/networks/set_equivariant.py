@@ -16,7 +16,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from esp_cli.networks.contract import IoSpec, Memoryless, Network
+from esp_cli.networks.contract import Generators, IoSpec, Memoryless, Network
 from esp_cli.networks.layers import SeedLinear, SeedMLP
 from esp_cli.networks.set_features import Rows, TeamFeatures
 from esp_cli.networks.sets import SetConfig, SetNetwork, sets_or_refuse
@@ -33,7 +33,7 @@ class SetEquivariantConfig(SetConfig):
     name: Literal["set-equivariant"] = "set-equivariant"  # type: ignore[assignment]
 
     def build(
-        self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
+        self, generators: Generators, inputs: int, outputs: int, output_gain: float, io: IoSpec | None
     ) -> Network:
         io = sets_or_refuse(self.name, self.io_or_refuse(io))
         if self.memory:
@@ -146,9 +146,7 @@ def _products(vectors: Tensor) -> list[Tensor]:
 class DirectionActor(Memoryless):
     """A number for each direction, by one network over sets that reads all vectors along that direction."""
 
-    def __init__(
-        self, generators: Sequence[torch.Generator], io: IoSpec, config: SetConfig, output_gain: float
-    ) -> None:
+    def __init__(self, generators: Generators, io: IoSpec, config: SetConfig, output_gain: float) -> None:
         super().__init__()
         action = io.spaces.action
         assert isinstance(action, Discrete)
@@ -163,9 +161,7 @@ class DirectionActor(Memoryless):
 class ForceActor(Memoryless):
     """Planar vectors that are weighed sums of those that are seen."""
 
-    def __init__(
-        self, generators: Sequence[torch.Generator], io: IoSpec, config: SetConfig, forces: int, output_gain: float
-    ) -> None:
+    def __init__(self, generators: Generators, io: IoSpec, config: SetConfig, forces: int, output_gain: float) -> None:
         super().__init__()
         self.features = TeamFeatures(generators, io, config)
         rows = self.features.encoder.rows

@@ -13,7 +13,7 @@ import torch
 from pydantic import Field as Setting
 from torch import Tensor, nn
 
-from esp_cli.networks.contract import ActivationName, IoSpec
+from esp_cli.networks.contract import ActivationName, Generators, IoSpec
 from esp_cli.networks.kernels.library import begin, computes
 from esp_cli.networks.kernels.sets import compiled_distances, compiled_pool
 from esp_cli.networks.layers import GAINS, SeedMLP
@@ -128,7 +128,7 @@ def distances_among(places: Sequence[Tensor]) -> list[Tensor]:
 class Embedding(SeedMLP):
     """A perceptron that ends with an activation, shared by like things."""
 
-    def __init__(self, generators: Sequence[torch.Generator], sizes: Sequence[int], config: SetShape) -> None:
+    def __init__(self, generators: Generators, sizes: Sequence[int], config: SetShape) -> None:
         name = config.activation
         super().__init__(generators, sizes, name, GAINS[name], activate_output=True, compiled=config.compiled is True)
 
@@ -143,7 +143,7 @@ class Embedding(SeedMLP):
 class SetEncoder(nn.Module):
     """Features [S, B, width] of rows that show sets."""
 
-    def __init__(self, generators: Sequence[torch.Generator], rows: Rows, config: SetShape) -> None:
+    def __init__(self, generators: Generators, rows: Rows, config: SetShape) -> None:
         super().__init__()
         self.rows, features = rows, config.width
         self.own = Embedding(generators, (rows.num_own, features), config) if rows.num_own > features else None
@@ -178,12 +178,7 @@ class TeamFeatures(nn.Module):
     """
 
     def __init__(
-        self,
-        generators: Sequence[torch.Generator],
-        io: IoSpec,
-        config: SetShape,
-        beside: int = 0,
-        rows: Rows | None = None,
+        self, generators: Generators, io: IoSpec, config: SetShape, beside: int = 0, rows: Rows | None = None
     ) -> None:
         super().__init__()
         spaces, compiled, joint = io.spaces, config.compiled is True, io.reads == "observations"

@@ -11,14 +11,13 @@ Shape letters: S seeds, B rows, N agents, H features of a thing.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Literal
 
 import torch
 from pydantic import Field as Setting
 from torch import Tensor, nn
 
-from esp_cli.networks.contract import IoSpec, Memoryless, Network
+from esp_cli.networks.contract import Generators, IoSpec, Memoryless, Network
 from esp_cli.networks.joint_q import HYPER_GAIN
 from esp_cli.networks.layers import SeedMLP
 from esp_cli.networks.plain import GRU, GruConfig
@@ -41,19 +40,17 @@ class SetConfig(SetShape):
         return self.memory
 
     def build(
-        self, generators: Sequence[torch.Generator], inputs: int, outputs: int, output_gain: float, io: IoSpec | None
+        self, generators: Generators, inputs: int, outputs: int, output_gain: float, io: IoSpec | None
     ) -> Network:
         io = sets_or_refuse(self.name, self.io_or_refuse(io))
         if self.memory and io.num_values is None:
             return RecurrentSetNetwork(generators, io, inputs, outputs, self, output_gain)
         return SetNetwork(generators, io, outputs, self, output_gain)
 
-    def joint_critic(
-        self, generators: Sequence[torch.Generator], io: IoSpec, actions: int, further: int
-    ) -> nn.Module | None:
+    def joint_critic(self, generators: Generators, io: IoSpec, actions: int, further: int) -> nn.Module | None:
         return SetQ(generators, io, self, actions, further)
 
-    def mixer(self, generators: Sequence[torch.Generator], io: IoSpec, width: int, further: int) -> nn.Module | None:
+    def mixer(self, generators: Generators, io: IoSpec, width: int, further: int) -> nn.Module | None:
         return SetMixer(generators, io, self, width, further)
 
     def least_parameters(self, inputs: int) -> int:
@@ -75,7 +72,7 @@ class SetNetwork(Memoryless):
 
     def __init__(
         self,
-        generators: Sequence[torch.Generator],
+        generators: Generators,
         io: IoSpec,
         outputs: int,
         config: SetConfig,
@@ -103,13 +100,7 @@ class RecurrentSetNetwork(Network):
     """An agent's sets in, its outputs out, with a memory of their features; the previous action may stand behind."""
 
     def __init__(
-        self,
-        generators: Sequence[torch.Generator],
-        io: IoSpec,
-        inputs: int,
-        outputs: int,
-        config: SetConfig,
-        output_gain: float,
+        self, generators: Generators, io: IoSpec, inputs: int, outputs: int, config: SetConfig, output_gain: float
     ) -> None:
         super().__init__()
         self.activation, self.width = config.activation, io.layout.width
@@ -132,9 +123,7 @@ class RecurrentSetNetwork(Network):
 class SetQ(nn.Module):
     """MADDPG's critic over the set of all agents' (observation, action); `further` numbers stand behind a scene."""
 
-    def __init__(
-        self, generators: Sequence[torch.Generator], io: IoSpec, config: SetConfig, actions: int, further: int
-    ) -> None:
+    def __init__(self, generators: Generators, io: IoSpec, config: SetConfig, actions: int, further: int) -> None:
         super().__init__()
         self.features = TeamFeatures(generators, io, config, actions)
         self.features.each_or_refuse(io)
@@ -159,9 +148,7 @@ class SetMixer(nn.Module):
     h_i are the features of agent i and h those of the scene, so that exchanging agents changes nothing.
     """
 
-    def __init__(
-        self, generators: Sequence[torch.Generator], io: IoSpec, config: SetConfig, width: int, further: int
-    ) -> None:
+    def __init__(self, generators: Generators, io: IoSpec, config: SetConfig, width: int, further: int) -> None:
         super().__init__()
         self.features = TeamFeatures(generators, io, config)
         self.features.each_or_refuse(io)
