@@ -14,8 +14,7 @@ from esp_envs.errors import UserError
 from esp_envs.settings import TaskSettings
 from esp_envs.spec import Discrete, TaskSpec
 
-World = dict[str, Tensor]
-"""The tensors of all worlds by the name of their field in `spec.state`: [S, E, items, numbers of an item]."""
+World = dict[str, Tensor]  # all worlds' tensors by field of `spec.state`: [S, E, items, numbers of an item]
 Outcome = tuple[Tensor, dict[str, Tensor]]  # the reward [S, E] or [S, E, N] of a step and its metrics [S, E]
 _FURTHER = "world."  # what the names of saved tensors begin with that are no fields of the state
 

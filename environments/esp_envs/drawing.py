@@ -20,8 +20,7 @@ FRAME = "#c8c8c0"
 _RIM_DARKENING = 0.7
 TRAIL_WIDTH = 0.3  # width of a trail against the body's radius
 _TRAIL_STRENGTH = 0.8  # how much of the body's colour the newest end of a trail has; the oldest has almost none
-_LEAST_LETTER, _MOST_LETTER = 6.0, 18.0
-"""Radius of a disc that a letter fits on, and height of the largest letter, pixels."""
+_LEAST_LETTER, _MOST_LETTER = 6.0, 18.0  # radius of a disc that a letter fits on, height of the largest letter, pixels
 _SHAPES = ("disc", "ring", "cross", "square")
 
 _Color = tuple[int, ...]

@@ -111,8 +111,7 @@ def require_equal(what: str, got: object, expected: object) -> None:
     require(got == expected, f"{what} is {got}, expected {expected}")
 
 
-_MANY, _ENOUGH = 40, 4000
-"""Worlds among which some end early at random, and steps of an episode times worlds that are enough."""
+_MANY, _ENOUGH = 40, 4000  # worlds among which some end early at random, and steps of an episode times worlds
 
 
 def observations_rewards_and_metrics_fit_the_spec(subject: Subject) -> None:

@@ -82,8 +82,7 @@ def wildlife_spec(settings: WildlifeSettings) -> TaskSpec:
 
 
 _DRONE = ((0.0, 1.0, 0.0), (1.0, 1.0, 1.0), (0.0, 1.0, 0.0))
-_POACHER = ((1.0, 0.0, 1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 1.0))
-"""A plus and a cross: both are the same after every turn and mirror of the square."""
+_POACHER = ((1.0, 0.0, 1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 1.0))  # plus and cross: the same in all images of the square
 
 
 class Wildlife(BatchedTask):

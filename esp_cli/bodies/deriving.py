@@ -22,8 +22,7 @@ from esp_cli.symmetry.elements import Floats, Indices
 from esp_cli.symmetry.plane import PlaneElement
 from esp_envs.errors import UserError
 
-LOOSE = 0.1
-"""How far a joint's line may be off, as a share of the robot's size, or of the length of its axis, to be matched."""
+LOOSE = 0.1  # how far a matched joint's line may be off, as a share of the robot's size, or of its axis' length
 FAR = 0.25  # how far a body's middle of mass may be off, as a share of the robot's size, to be matched
 _APART = 1e6
 

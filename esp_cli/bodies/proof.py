@@ -18,13 +18,11 @@ from esp_cli.bodies.frame import BALL, FREE, Frame
 from esp_cli.bodies.reading import printable
 from esp_cli.symmetry.elements import Floats
 
-EXACT, NEARLY = 1e-5, 0.05
-"""Largest gap of a mirror that is exact up to rounding, and of one that holds but for a model's small asymmetry."""
+EXACT, NEARLY = 1e-5, 0.05  # largest gap of a mirror exact up to rounding, and but for a model's small asymmetry
 SEEN = 3.0  # how many times the gap of a planted mistake exceeds the gap without it, where the proof would have seen it
 NO_MIRROR = (mujoco.mjtSensor.mjSENS_USER, mujoco.mjtSensor.mjSENS_PLUGIN)
 """Kinds of sensors of which nobody knows what their readings mean."""
-_STATES, _LYING, _PLANTED = 48, 24, 12
-"""States that are compared, those that are laid on the floor, and those for each planted mistake."""
+_STATES, _LYING, _PLANTED = 48, 24, 12  # states that are compared, that are laid on the floor, and for each mistake
 _NO_CONSTRAINTS, _NO_SENSORS, _NO_CONTACTS = (
     int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in ("CONSTRAINT", "SENSOR", "CONTACT")
 )

@@ -18,8 +18,7 @@ from esp_cli.symmetry.plane import PlaneElement, mirror
 from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, Spaces
 
-_TRIED = ("d8", "d12", "rot57", "flip23")
-"""Turns and mirrors that are tried; the last two stand for all angles. Of n moves d-n is tried, too."""
+_TRIED = ("d8", "d12", "rot57", "flip23")  # the last two stand for all angles; of n moves d-n is tried, too
 _EXCHANGES = 28  # up to so many exchanges (those of 8 agents) all pairs are tried; of more things, only neighbours
 _MOST_CORNERS = 64  # a turn by another part of the whole than one of these stands for all angles, as 57 degrees
 _MOST = 64  # of longer lists only generators are tried: where these hold, so do their products

@@ -15,8 +15,7 @@ from esp_envs.spec import Layout
 STILL = 1e-6  # standard deviation below which a number does not change
 _PLANES = 12  # vectors that are looked at one by one, at most
 _COUNT = 28
-_FEWEST = 0.8
-"""An element is confronted with a function whose squared difference from its image is at least this, in variances."""
+_FEWEST = 0.8  # difference of a function from its image, squared, in variances, from which an element faces it
 
 
 _PLACES = torch.tensor([[1.2, 0.3], [-0.8, 1.0], [-0.3, -1.4]])

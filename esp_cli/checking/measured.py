@@ -18,8 +18,7 @@ from esp_envs.errors import UserError
 from esp_envs.registry import task_class
 from esp_envs.views import worlds_of_role
 
-_HORIZON = 50
-"""Steps of an episode, at most, where a task has such a setting: of a longer one only the beginning is looked at."""
+_HORIZON = 50  # steps of an episode, at most, where a task has such a setting: of longer ones the beginning
 
 
 def prepared(config: RunConfig) -> RunConfig:

@@ -44,8 +44,7 @@ from esp_envs.promises import MakeWorlds
 from esp_envs.spec import Layout, TaskSpec
 
 _MOST_WORLDS = 256
-_NUMBERS = 1 << 18
-"""Numbers that all worlds together may show their agents at once; pictures are compared in fewer worlds."""
+_NUMBERS = 1 << 18  # that all worlds together may show their agents at once; with pictures they are fewer
 TOLERATED = 0.15  # standard deviations that a field with chance may be off, where it is not found broken
 _BOUND = 0.05  # where the bounded distance levels off, in standard deviations of the field
 _ROUNDINGS, _UNCLEAR = 10.0, 0.05
@@ -56,8 +55,7 @@ _FEW = 0.05
 """Share of the states further out that may differ: in some that play never reaches, contacts are solved in the order
 in which a simulator numbers them."""
 _FURTHER = "holds where play went, but further out {} would differ"
-_HERE, _THERE = (101, 102), (103, 104)
-"""Seeds of the two runs from the states, and of two from their images, which have chance of their own."""
+_HERE, _THERE = (101, 102), (103, 104)  # seeds of two runs from the states, two from images, with own chance
 Outcomes = dict[str, Tensor]  # what a step gives, by field: [M, numbers]
 
 

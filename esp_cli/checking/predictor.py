@@ -15,11 +15,9 @@ from esp_envs.spec import Discrete, Spaces, others_of
 
 _HIDDEN, _BATCH, _UPDATES, _RATE = 64, 256, 600, 5e-3
 _RIDGE, _LEAST = 1e-2, 1e-9
-_WIDEST_PAIRS, _WIDEST_OTHERS = 48, 160
-"""Most numbers of one agent whose products are looked at, and of all other agents, beyond which they only act."""
+_WIDEST_PAIRS, _WIDEST_OTHERS = 48, 160  # most numbers of an agent with products, and of others that are seen
 _BUMPS, _BREADTH = 32, 0.6  # bumps for each vector, and how broad one is, in standard deviations of the vector
-_CELLS = 24
-"""Parts of each number of a vector, of equally many steps: what has sharp edges is averaged in the cells of both."""
+_CELLS = 24  # parts of each number of a vector, of equally many steps, in which what has sharp edges is averaged
 _ROUNDING = 1e-3
 _CHUNK = 512  # episodes whose features are held at once
 

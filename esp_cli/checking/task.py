@@ -24,8 +24,7 @@ from esp_envs.views import RoleView
 PAIRED, TRANSITIONS = "paired states", "transitions"
 TOLERATED = {PAIRED: paired.TOLERATED, TRANSITIONS: transitions.TOLERATED}
 """Standard deviations that a field may be off and yet hold, by method."""
-_COPIES, _FOREIGN = 256, 64
-"""Worlds of a task that cannot be set to a state, and of a simulator of others that can, at most."""
+_COPIES, _FOREIGN = 256, 64  # most worlds of a task that takes no state, and of a simulator of others that does
 _EPISODES = 4096
 _UNTRIED = "shifts are tried where a task can be set to a state"
 _SEVERAL = "no state holds these items, and each agent's transitions do not show what others see beside them"

@@ -34,13 +34,11 @@ from esp_envs.spec import Discrete, Spaces
 
 FEWEST = 64  # episodes (or single transitions) below which nothing can be told
 TOLERATED = 0.2  # standard deviations of a field that a step from the image may differ from the step's image
-_SEEN = 0.1
-"""Share of the tolerance, squared, from which a gap that is no chance is a breaking: predictors are never exact."""
+_SEEN = 0.1  # squared share of the tolerance from which a gap beyond chance is a breaking: predictors err
 _DOUBTFUL = 4.0  # standard errors from which such a gap is no breaking yet, but leaves an element uncovered
 _HIDES = 0.25  # share of the variance of rewards from which on the rarest hundredth of them hides what is usual
 _MOST_ROWS = 1 << 15  # steps of agents that are looked at, at most; of more episodes every k-th step
-_FEWEST_INSIDE = 0.5
-"""Share of the images that lie where transitions do, below which they show nothing; these alone are judged."""
+_FEWEST_INSIDE = 0.5  # least share of images that lie where transitions do to show something; these are judged
 _PREFERS, _ELSEWHERE = 0.05, 0.5
 """Shifts of starts or first actions, in standard deviations: from the first on, what looks broken may be a preference;
 from the second on, of starts, images lie where no transition does."""

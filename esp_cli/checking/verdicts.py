@@ -15,10 +15,8 @@ from esp_cli.symmetry import Element
 Watch = Callable[[int, int, str], object]
 """Takes how many of how many are done, and of what: "steps" while states or transitions are collected, "elements"."""
 Outcome = Literal["holds", "broken", "not covered"]
-RANK: dict[Outcome, int] = {"holds": 0, "not covered": 1, "broken": 2}
-"""The outcome of several verdicts is the one of the highest rank."""
-SIGNIFICANT = 6.0
-"""Standard errors that a gap must exceed to be a breaking: with thousands of comparisons, chance alone reaches 4."""
+RANK: dict[Outcome, int] = {"holds": 0, "not covered": 1, "broken": 2}  # of several outcomes the highest counts
+SIGNIFICANT = 6.0  # standard errors of a gap that is a breaking: of thousands of comparisons some reach 4
 NEGLIGIBLE = 1e-3  # gap against the field's spread below which a difference is rounding
 LATE = "not tried, as the time was over"
 LEVEL = 0.05  # probability with which an element that is off by the tolerance may be said to hold, at most

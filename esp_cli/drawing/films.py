@@ -25,8 +25,7 @@ Frame = NDArray[np.uint8]
 LEAST_WIDTH = 200  # pixels; narrower pictures have no room for text
 _PAPER, _TEXT, _FAINT = "#ffffff", "#202020", "#606060"
 _FONT_SHARE, _LEAST_FONT = 1 / 37, 10  # height of letters against the width of a picture, and the smallest, pixels
-_BAR, _TICKS, _SIDE = 2.0, 1.5, 2.6
-"""Height of a bar of text, height of the numbers below and width of those beside a picture, in letters."""
+_BAR, _TICKS, _SIDE = 2.0, 1.5, 2.6  # height of a bar of text, of the numbers below, width of those beside, in letters
 _OVERSAMPLING = 3
 _GAP = 8  # pixels between two pictures
 GIF_FRAMES_PER_SECOND = 50  # players slow down a GIF that is faster

@@ -24,8 +24,7 @@ from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.settings import parse_config
 from esp_envs.errors import UserError
 
-FOLDER_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")
-"""What a run may be called: nothing is written outside the folder of the set."""
+FOLDER_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")  # so that nothing is written outside of the set
 
 
 class StudyError(UserError):

@@ -57,8 +57,7 @@ class Snapshot:
         return sum(run.status in statuses for run in self.runs)
 
 
-Listener = Callable[[Snapshot], bool]
-"""Told of progress; returns False to ask all running processes to stop after their iteration."""
+Listener = Callable[[Snapshot], bool]  # told of progress; returns False to ask all processes to stop cleanly
 
 
 class Scheduler:

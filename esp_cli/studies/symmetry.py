@@ -27,8 +27,7 @@ from esp_cli.training.metrics import column, read_metrics
 from esp_envs.errors import UserError
 from esp_envs.registry import TASKS as TASK_CLASSES
 
-PERCEPTRON, HOMOMORPHIC = "<perceptron>", "<homomorphic>"
-"""Stand for the plain network of a task and for the one that commutes with a group: numbers and pictures differ."""
+PERCEPTRON, HOMOMORPHIC = "<perceptron>", "<homomorphic>"  # a task's plain network, and the one that commutes
 _PLAIN: Settings = {"network.name": PERCEPTRON, "prior.kind": "none"}
 _ESP: Settings = {"network.name": PERCEPTRON, "prior.kind": "esp"}
 _SETS: Settings = {"network.name": "set", "prior.kind": "none", "mappo.critic_input": "state"}

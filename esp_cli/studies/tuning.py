@@ -22,8 +22,7 @@ from esp_envs.errors import UserError
 SMOOTHED = 3  # evaluations, up to the newest, whose mean is the score of a curve
 RUNGS = 2  # times that successive halving looks at a trial before its end
 REDUCTION = 3  # one of so many trials goes on at each rung, and trains so many times as long
-_GIVEN = ("task", "evaluation")
-"""Sections that no search varies: it would choose the easiest task, or the evaluation that scores highest."""
+_GIVEN = ("task", "evaluation")  # varied, a search would take the easiest task, or the best-scoring evaluation
 NAMES = {"none": "plain", "esp": "ESP", "auto": "auto", "augment": "augmentation", "consistency": "loss"}
 
 

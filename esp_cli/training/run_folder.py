@@ -45,8 +45,7 @@ from esp_cli.training.folder_names import CHECKPOINTS, CONFIG, INITIAL, LOCK, ME
 from esp_envs.errors import UserError
 
 KEPT_CHECKPOINTS = 2  # so that a damaged newest one leaves another to go on from
-RUN_ID, CONFIG_SHA256 = "run_id", "config_sha256"
-"""Keys of `config.json` and of a checkpoint's description; folders and checkpoints of esp 0.1 may lack them."""
+RUN_ID, CONFIG_SHA256 = "run_id", "config_sha256"  # keys of `config.json` and of checkpoints, but of esp 0.1
 _CHECKPOINT_NAME = re.compile(r"step-(\d{12})(-final)?\.safetensors")
 
 

@@ -72,8 +72,7 @@ class Progress:
     notes: tuple[str, ...] = ()
 
 
-Listener = Callable[[Progress], bool | None]
-"""Told of progress; returns False to ask for a clean stop after this iteration."""
+Listener = Callable[[Progress], bool | None]  # told of progress; returns False to ask for a clean stop after it
 
 
 class Trainer:

@@ -16,8 +16,7 @@ TIMESTEP_S = 0.01
 class Physics(ABC):
     """W worlds of N robots and M pillars in one arena, in float64 on the CPU."""
 
-    remembered: ClassVar[tuple[str, ...]]
-    """Names of the arrays that a world's future depends on; the attributes have an underscore before them."""
+    remembered: ClassVar[tuple[str, ...]]  # arrays that a world's future depends on; attributes have an underscore
     _pose: Array
     _velocity: Array
 

@@ -10,15 +10,11 @@ import itertools
 import torch
 from torch import Tensor
 
-LOOKAHEAD_S = 0.2
-"""Time over which the present velocity is taken to carry an agent on; found by search, it brakes in time."""
-FULL_FORCE_DISTANCE = 0.2
-"""How far one step of full force carries an agent in all (0.5 length/s, fading by a quarter a step, 0.1 s each)."""
+LOOKAHEAD_S = 0.2  # for which the present velocity carries an agent on; found by search, it brakes in time
+FULL_FORCE_DISTANCE = 0.2  # that a step of full force makes in all (0.5 length/s, less by a quarter a step, 0.1 s)
 MAX_SHARINGS = 4096  # most ways of sharing out landmarks that `shared_out` should try
-MOST_ASSIGNED = 2000
-"""Agents or landmarks up to which `assigned` shares them out by the Hungarian method, whose time is cubic."""
-TRAVEL_WEIGHT = 0.25
-"""Weight of the distance to travel against the distance that remains, in `shared_out`; found by search."""
+MOST_ASSIGNED = 2000  # agents or landmarks that `assigned` shares out by the Hungarian method, whose time is cubic
+TRAVEL_WEIGHT = 0.25  # of the distance to travel against that which remains, in `shared_out`; found by search
 
 
 def approach(goal: Tensor, position: Tensor, velocity: Tensor) -> Tensor:

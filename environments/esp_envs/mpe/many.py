@@ -7,8 +7,7 @@ from torch import Tensor
 
 from esp_envs.mpe.particles import CONTACT_MARGIN, Bodies, ParticleWorlds, contact_strength, lanes_of
 
-MOST_BODIES = 8
-"""Agents up to which pairs are listed and observations are one matrix product, which is faster for few of them."""
+MOST_BODIES = 8  # agents up to which pairs are listed and observations are one matrix product, then the faster way
 BY_TREE = 200  # agents from which on the near ones are found by a tree, on the CPU: N log N, where all pairs are N^2
 _PAIRS = 1 << 21  # pairs that are looked at together
 _NO_PUSH = 60 * CONTACT_MARGIN  # gap between two rims from which on a push is 0 in float32

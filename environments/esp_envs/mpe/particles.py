@@ -31,10 +31,8 @@ CONTACT_MARGIN = 1e-3  # length over which a contact fades in
 LANE_MULTIPLE = 64
 """The worlds axis is padded to a multiple of this, so that vector code never runs a scalar tail: the numbers of a world
 do not depend on how many worlds stand beside it."""
-_SOFTPLUS_RANGE = (-60.0, 20.0)
-"""Above it softplus(x) is x in float32; below it the push is some 1e-26, and exp would lose time by underflowing."""
-_SMALLEST_SQUARED_DISTANCE = 1e-24
-"""Keeps the direction of a contact finite when two centres coincide (the force is then zero)."""
+_SOFTPLUS_RANGE = (-60.0, 20.0)  # above, softplus(x) is x in float32; below, it is some 1e-26, and exp would underflow
+_SMALLEST_SQUARED_DISTANCE = 1e-24  # keeps a contact's direction finite where two centres coincide (force 0)
 
 
 @dataclass(frozen=True)

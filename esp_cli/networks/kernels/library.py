@@ -22,8 +22,7 @@ if TYPE_CHECKING:  # a kernel may be begun before torch is imported
 _OPTIONS = ("-O2", "-march=native", "-ffp-contract=fast", "-fopenmp", "-fPIC", "-shared", "-std=gnu++17")
 
 PADDING = 16  # PAD of vectors.h
-WORTH_COMPILING = 100_000
-"""Steps per seed from which kernels save more than the seconds in which they are compiled, also with one seed."""
+WORTH_COMPILING = 100_000  # steps per seed from which kernels save more seconds than they take to compile
 
 _folders: set[str] = set()  # of kernels that were begun and are not loaded
 
