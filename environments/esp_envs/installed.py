@@ -44,16 +44,10 @@ class Registry(Mapping[str, type[T]]):
         self._registered: dict[str, type[T]] = {}
 
     def register(self, given: str | type[T]) -> str:
-        """Admit a class that is not installed; return the name by which it is then known.
+        """Admit a class that is not installed, or "module:Class"; return the name by which it is then known.
 
         The working directory is importable while the module is imported, as it is for a script. Call this for a class
-        that the user named, never for a name that was read from a file.
-
-        Args:
-            given: "module:Class", or the class itself. Any other name is returned as it is.
-
-        Raises:
-            UserError: the module cannot be imported, or holds no such class.
+        that the user named, never for a name that was read from a file. Any other name is returned as it is.
         """
         if isinstance(given, str):
             if ":" not in given:

@@ -65,7 +65,7 @@ def spec_with_roles(roles: Sequence[Role], *, symmetry: str, state: Layout | Non
         num_agents=sum(role.num_agents for role in roles),
         observation=layout(Field("row", Kind.SCALAR, width)),
         action=_widest(actions),
-        state=_every_row(roles) if state is None else state,
+        state=layout(*(field for role in roles for field in _rows(role))) if state is None else state,
         symmetry=symmetry,
         shared_reward=False,
         masks=any(role.masks for role in roles),
@@ -100,10 +100,6 @@ def _widest(actions: Sequence[ActionSpace]) -> ActionSpace:
 def _rows(role: Role) -> list[Field]:
     rows = joint_layout(role.observation, role.num_agents).fields
     return [replace(f, name=f"{role.name}.{f.name}", items=Items.FIXED) for f in rows]
-
-
-def _every_row(roles: Sequence[Role]) -> Layout:
-    return layout(*(field for role in roles for field in _rows(role)))
 
 
 def _own_state(own: Role, roles: Sequence[Role], state: Layout | None) -> Layout:

@@ -9,18 +9,9 @@ from pydantic import BaseModel, ConfigDict
 
 @dataclass(frozen=True)
 class Breaks:
-    """What a setting leaves of a task's symmetry while it is not 0; it annotates the setting.
+    """What a setting leaves of a symmetry while it is not 0, as `wind: Annotated[float, Breaks("flip-x")] = 0.0`."""
 
-    Attributes:
-        plane: the planar group that is left, the name of the settings' attribute that says it, or None where nothing of
-            the plane is broken.
-
-    Example:
-        class WindySettings(TaskSettings):
-            wind: Annotated[float, Breaks("flip-x")] = 0.0
-    """
-
-    plane: str | None
+    plane: str | None  # the planar group that is left, or the attribute that says it; None: all of it
 
 
 class TaskSettings(BaseModel):

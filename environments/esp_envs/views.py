@@ -194,16 +194,12 @@ class Compass(Environment):
 
     Dynamics and reward may prefer a direction. Written for a scene whose frame is an input, they are a function of
     scene and frame, and turning both changes nothing: f(L_g s, g frame, K_g a) = L_g f(s, frame, a) for every g,
-    whatever f is. So a prior that turns the frame too never says anything false. The task itself only shows the
-    frame that stands still.
+    whatever f is. So a prior that turns the frame too never says anything false. The task itself only shows the frame
+    that stands still.
 
-    The frame is the two axes of the plane, as planar vectors: one vector alone is its own image in a mirror. Where
-    agents are exchanged, each also sees a number that goes with it to its new place.
-
-    Args:
-        inner: the worlds.
-        length: of both vectors; a short one is hard to learn from, so that the symmetry is given up late.
-        labels: whether each agent sees a number of its own.
+    The frame is the two axes of the plane, as planar vectors: one vector alone is its own image in a mirror. Short
+    ones, by `length`, are hard to learn from, so that the symmetry is given up late. Where agents are exchanged,
+    `labels` let each see a number that goes with it to its new place.
     """
 
     has, heuristic, scene, painter = map(_of_the_worlds, ("has", "heuristic", "scene", "painter"))

@@ -109,9 +109,7 @@ def explained_variance(value: Tensor, target: Tensor, valid: Tensor | None = Non
 
 def _variance(x: Tensor, valid: Tensor | None) -> Tensor:
     """Return the variance [S] of each seed over what counts."""
-    if valid is None:
-        return x.flatten(1).var(1, correction=0)
-    return mean_per_seed(_centred(x, valid).square(), valid)
+    return x.flatten(1).var(1, correction=0) if valid is None else mean_per_seed(_centred(x, valid).square(), valid)
 
 
 def ppo_loss(head: Any, outputs: Any, copies: Copies[Any], clip_epsilon: float, entropy_coef: float) -> Loss:

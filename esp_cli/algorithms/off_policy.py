@@ -159,16 +159,12 @@ class OffPolicyLearner(Learner):
     ) -> Tensor:
         """Return targets [S, B, T, C] from standardised rewards and the target network's values of what followed.
 
-        Rewards are divided by the root of the horizon too: the sum of T independent ones then has variance 1, so that
-        values, and with them S_Q and c, mean about the same in every task. Mean and variance are those of one agent's
-        reward; a team's, the mean of rewards of the agents' own, varies less. Where an episode or an agent may end
-        early, the mean is not taken off: it would pay for each step that is still to come, or charge for it.
-
-        Args:
-            batch: the originals.
-            reward: [S, B, T, C] as it was paid.
-            next_value: [S, B, T, C].
-            bonus: [S, B, T, C], added to the value of what followed and to the lambda-return from there: an entropy.
+        Rewards, `reward` as they were paid, are divided by the root of the horizon too: the sum of T independent ones
+        then has variance 1, so that values, and with them S_Q and c, mean about the same in every task. Mean and
+        variance are those of one agent's reward; a team's, the mean of rewards of the agents' own, varies less. Where
+        an episode or an agent may end early, the mean is not taken off: it would pay for each step that is still to
+        come, or charge for it. `bonus`, an entropy, is added to the value of what followed and to the lambda-return
+        from there.
         """
         config = self.config
         last = batch.valid & ~nn.functional.pad(batch.valid[:, :, 1:], (0, 1))

@@ -17,28 +17,20 @@ from esp_envs.errors import UserError
 
 @dataclass
 class Rollout:
-    """T steps of E worlds for S seeds.
+    """T steps of E worlds for S seeds."""
 
-    Shape:
-        obs [S, E, T, N, D], state [S, E, T, state width], action [S, E, T, N(, width)] (latent, as the head drew it),
-        log_prob and reward [S, E, T, N], terminated and ended [S, E, T] bool, action_mask [S, E, T, N, A] bool or None;
-        where agents end, alive and gone [S, E, T, N] bool: before the step, and no more after it.
-
-    `last` is the observation after the final step; `finals[t]` the final observation of episodes that ended at t.
-    """
-
-    obs: Tensor
-    state: Tensor
-    action: Tensor
-    log_prob: Tensor
-    reward: Tensor
-    terminated: Tensor
-    ended: Tensor
-    last: Observation
-    finals: dict[int, Observation] = field(default_factory=dict)
-    action_mask: Tensor | None = None
-    alive: Tensor | None = None
-    gone: Tensor | None = None
+    obs: Tensor  # [S, E, T, N, D]
+    state: Tensor  # [S, E, T, state width]
+    action: Tensor  # [S, E, T, N(, width)], latent, as the head drew it
+    log_prob: Tensor  # [S, E, T, N]
+    reward: Tensor  # [S, E, T, N]
+    terminated: Tensor  # [S, E, T] bool
+    ended: Tensor  # [S, E, T] bool
+    last: Observation  # after the final step
+    finals: dict[int, Observation] = field(default_factory=dict)  # by t the final one of episodes that ended
+    action_mask: Tensor | None = None  # [S, E, T, N, A] bool
+    alive: Tensor | None = None  # [S, E, T, N] bool before the step, where agents end
+    gone: Tensor | None = None  # likewise, no more after the step
 
 
 @dataclass

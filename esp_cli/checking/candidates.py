@@ -100,9 +100,7 @@ def _moved(element: Element, spaces: Spaces) -> tuple[float, ...]:
 
 def is_declared(element: Element | Shift, spaces: Spaces) -> bool:
     """Return whether a task's declared symmetry holds an element, or it declares shifts."""
-    if isinstance(element, Shift):
-        return spaces.shifts
-    return declares(spaces.symmetry, spaces.num_agents)(element)
+    return spaces.shifts if isinstance(element, Shift) else declares(spaces.symmetry, spaces.num_agents)(element)
 
 
 def _elements(text: str, num_agents: int) -> tuple[Element, ...]:

@@ -13,10 +13,9 @@ from esp_cli.defaults import EPISODES
 
 if TYPE_CHECKING:
     from esp_cli.policies.evaluation import FinalEvaluation
-    from esp_cli.policies.loading import TrainedPolicy
     from esp_cli.policies.statistics import EpisodeSpread, SeedSummary
 
-_AGENT_STEPS = 100_000  # of each policy, beyond which fewer episodes are played
+_AGENT_STEPS = 100_000  # of each policy, beyond which fewer episodes are played: a bundled policy of robots takes 20 s
 EPILOG = """Examples:\n
     esp eval navigation --algo mappo --prior none\n
     esp eval runs/cn-mappo\n
@@ -56,16 +55,12 @@ def evaluate(
     trained = open_policy(policy, algo, prior).transfer(options.parse_task_settings(settings or [], physics))
     for text in trained.notes:
         console.note(text)
-    result = evaluate_policy(trained, episodes or _default(trained))
+    usual = max(1, min(EPISODES, _AGENT_STEPS // (trained.spec.horizon * trained.spec.num_agents)))
+    result = evaluate_policy(trained, episodes or usual)
     if not episodes and result.episodes < EPISODES:
         console.note(f"episodes are long: {result.episodes} each, not {EPISODES}; --episodes {EPISODES} for less error")
     source = trained.source
     console.result(json, result, lambda: _print(result, source.stem if source.is_file() else str(source)))
-
-
-def _default(trained: TrainedPolicy) -> int:
-    """Return how many episodes are played unless the user says so: a bundled policy of robots is done in 20 s."""
-    return max(1, min(EPISODES, _AGENT_STEPS // (trained.spec.horizon * trained.spec.num_agents)))
 
 
 def _print(result: FinalEvaluation, policy: str) -> None:

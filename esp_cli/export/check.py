@@ -15,7 +15,6 @@ from torch import Tensor
 from esp_cli.export.layers import Floats
 from esp_cli.export.program import Program
 from esp_cli.networks.heads import masked
-from esp_cli.networks.policy import Policy
 from esp_cli.policies.loading import TrainedPolicy
 
 OBSERVATIONS = 10_000  # observations on which every export is compared with its policy
@@ -77,7 +76,9 @@ def take_sample(trained: TrainedPolicy, program: Program, count: int = OBSERVATI
         mask = torch.cat([mask, torch.from_numpy(rng.random((missing, program.num_outputs)) < 0.6)])
     allowed = None if mask is None else mask[None, None]
     action, after = trained.policy.act(obs[None, None], memory[None], action_mask=allowed)
-    outputs = _raw_outputs(trained.policy, obs, memory)
+    actor = trained.policy.actor  # its outputs before the head normalises them
+    hidden, previous = memory.split([actor.memory_width, memory.shape[1] - actor.memory_width], 1)
+    outputs = actor.step(torch.cat([obs, previous], 1)[None], hidden[None])[0][0]
     masks = None if mask is None else mask.numpy()
     own, sets = program.split(obs.numpy())
     return Sample(own, memory.numpy(), outputs.numpy(), action[0, 0].numpy(), after[0].numpy(), masks, sets)
@@ -101,12 +102,6 @@ def _play(trained: TrainedPolicy, count: int) -> tuple[Tensor, Tensor, Tensor | 
         observation = env.step(action).next
     obs, memory, *masks = (torch.cat(parts)[:count] for parts in zip(*rows, strict=True))
     return obs, memory, masks[0] if masks else None
-
-
-def _raw_outputs(policy: Policy, obs: Tensor, memory: Tensor) -> Tensor:
-    """Return the outputs of the actor's last layer, before its head normalises them: [B, O]."""
-    hidden, previous = memory.split([policy.actor.memory_width, memory.shape[1] - policy.actor.memory_width], 1)
-    return policy.actor.step(torch.cat([obs, previous], 1)[None], hidden[None])[0][0]
 
 
 def compare(sample: Sample, runner: Runner) -> Agreement:

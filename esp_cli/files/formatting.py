@@ -29,9 +29,7 @@ def format_mean(mean: float | None, sem: float | None = None) -> str:
     """Return "mean ± standard error", the mean alone where one sample leaves no error to state, a dash for no mean."""
     if mean is None:
         return NOTHING
-    if sem is None or not math.isfinite(sem):
-        return f"{mean:.2f}"
-    return f"{mean:.2f} ± {sem:.2f}"
+    return f"{mean:.2f} ± {sem:.2f}" if sem is not None and math.isfinite(sem) else f"{mean:.2f}"
 
 
 def format_interval(interval: Sequence[float] | None) -> str:

@@ -28,25 +28,17 @@ def copies_for(width: int, group: FiniteGroup, banks: int = 1) -> int:
 
 
 class ConstrainedLinear(nn.Module):
-    """y = x W + b for S seeds, with every W and b such that y transforms as it should when x does (Eq. 2).
+    """y = x W + b [S, B, out] for S seeds, with every W and b such that y transforms as it should when x does (Eq. 2).
 
     Between each block of the input and each of the output, W is a combination of the maps that commute with the group;
-    the coefficients are the parameters. For the group of one element it is a plain linear layer.
+    the coefficients are the parameters. For the group of one element it is a plain linear layer. The initial weights
+    are orthogonal ones of `gain`, projected onto what is allowed and scaled to keep their size.
 
-    Args:
-        generators: one CPU generator per seed, for the initial weights.
-        inputs: how x transforms.
-        outputs: how y transforms.
-        gain: the initial weights are orthogonal ones of this gain, projected onto what is allowed and scaled to keep
-            their size.
-        relax: how fast it leaves the symmetry; it begins with it. 0: never.
-        relaxation: what is relaxed. "residual": a plain layer beside it, which begins at 0 and need not commute,
-            y = x (W + relax F) + ..., the layer of residual pathway priors (Finzi et al., 2021). "weights": a number
-            v(h) of each output h of a feature, which begins at 0, in two filter banks that commute, W(h) = W_1(h) (1 +
-            relax v_1(h)) + W_2(h) relax v_2(h): relaxed weights (Wang et al., 2022; in learners Park et al., 2024).
-
-    Shape:
-        x: [S, B, in] -> [S, B, out].
+    It begins with the symmetry, and `relax` is how fast it leaves it. "residual": by a plain layer beside it, which
+    begins at 0 and need not commute, y = x (W + relax F) + ..., the layer of residual pathway priors (Finzi et al.,
+    2021). "weights": by a number v(h) of each output h of a feature, which begins at 0, in two filter banks that
+    commute, W(h) = W_1(h) (1 + relax v_1(h)) + W_2(h) relax v_2(h): relaxed weights (Wang et al., 2022; in learners
+    Park et al., 2024).
     """
 
     def __init__(

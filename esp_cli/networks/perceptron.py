@@ -221,9 +221,8 @@ def affine(bias: Tensor, x: Tensor, weight: Tensor, scale: float = 1.0, rows_inn
 
 def _down(grad: Tensor, weight: Tensor) -> Tensor:
     """Return grad W', the gradient by what a layer reads."""
-    if weight.shape[-1] == 1:
-        return grad * weight.transpose(1, 2)
-    return torch.bmm(grad, weight.transpose(1, 2))
+    across = weight.transpose(1, 2)
+    return grad * across if weight.shape[-1] == 1 else torch.bmm(grad, across)
 
 
 def _hidden(bias: Tensor, x: Tensor, weight: Tensor, activation: str) -> Tensor:

@@ -138,9 +138,7 @@ def _factor(word: str, text: str, num_agents: int) -> Element | Group:
 def _read_agents(word: str, num_agents: int) -> Element | Group | None:
     if word == AGENTS:
         return agent_permutations(num_agents)
-    if not re.fullmatch(r"agents(-\d{1,4})+", word):
-        return None
-    return Element(permutation=_order(word, num_agents))
+    return Element(permutation=_order(word, num_agents)) if re.fullmatch(r"agents(-\d{1,4})+", word) else None
 
 
 # what reads a word for N agents, or returns None; each kind of geometry has its own

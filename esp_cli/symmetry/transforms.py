@@ -111,9 +111,7 @@ class Transform:
 
     def per_agent(self, x: Tensor) -> Tensor:
         """Let a number per agent [S, ..., N] (reward, advantage) move with it; one per world [S, ..., 1] stays."""
-        if self.agents is None or x.shape[-1] == 1:
-            return x
-        return self._move(x, self.agents, agent_axis=-1)
+        return x if self.agents is None or x.shape[-1] == 1 else self._move(x, self.agents, agent_axis=-1)
 
     def push_outputs(self, outputs: Tensor) -> Tensor:
         """Apply K_g to one number per discrete action, or to those of a continuous one; undoes `pull_back`."""
