@@ -15,6 +15,7 @@ from importlib import import_module
 from typing import Annotated, Any
 
 import typer
+from typer import Option
 from typer.core import TyperGroup
 
 from esp_cli import console, machine
@@ -146,7 +147,7 @@ def _print_version(wanted: bool) -> None:
         raise typer.Exit
 
 
-_VERSION = typer.Option("--version", help="Print the version and leave.", callback=_print_version, is_eager=True)
+_VERSION = Option("--version", help="Print the version and leave.", callback=_print_version, is_eager=True)
 
 
 @app.callback()

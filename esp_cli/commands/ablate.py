@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Annotated, Literal
 
-import typer
+from typer import Argument, Option
 
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
 from esp_cli.commands.studying import run_or_forecast
@@ -24,7 +24,7 @@ EPILOG = """Examples:\n
 def ablate(
     part: Annotated[
         Literal["transforms", "coefficient", "modules", "prior", "breaking"],
-        typer.Argument(
+        Argument(
             help="Number and type of transforms (figures 5a, 5b), weight of the consistency loss (5c), loss and "
             "augmentation apart (6a), the learner with the whole prior and without it, or methods under broken "
             "symmetry.",
@@ -34,15 +34,11 @@ def ablate(
     choices: StudyChoices,
     methods: Annotated[
         list[str] | None,
-        typer.Option(
-            "--methods", help="What is compared, by the names in the table: 'plain,ESP,auto'; by default all."
-        ),
+        Option("--methods", help="What is compared, by the names in the table: 'plain,ESP,auto'; by default all."),
     ] = None,
     broken_by: Annotated[
         list[str] | None,
-        typer.Option(
-            "--broken-by", help="For breaking: the settings that break symmetry, as wind,mud; by default all."
-        ),
+        Option("--broken-by", help="For breaking: the settings that break symmetry, as wind,mud; by default all."),
     ] = None,
 ) -> None:
     """Vary one part of the prior and hold all else fixed; called again, it goes on where it was."""

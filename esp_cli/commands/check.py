@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
+from typer import Argument, Option
 
 from esp_cli import console
 from esp_cli.commands import options
@@ -34,31 +35,31 @@ _ROUNDING = 1e-4  # how far a step from a restored state may differ: physics may
 def check(
     what: Annotated[
         Literal["task", "symmetry", "mirror", "policy"],
-        typer.Argument(help="What to check.", metavar="task|symmetry|mirror|policy"),
+        Argument(help="What to check.", metavar="task|symmetry|mirror|policy"),
     ],
     task: Annotated[
         str,
-        typer.Argument(
+        Argument(
             help="A task that `esp tasks` lists, or module:Class; a mirror as module:function; a policy as ONNX, "
             "TorchScript or module:function.",
             metavar="NAME",
         ),
     ],
     robot: Annotated[
-        Path | None, typer.Argument(help="Its MJCF or URDF file, of a mirror or a policy.", metavar="ROBOT.xml")
+        Path | None, Argument(help="Its MJCF or URDF file, of a mirror or a policy.", metavar="ROBOT.xml")
     ] = None,
     transforms: Annotated[
-        str | None, typer.Option("--transforms", help="Elements to try, as d8*agents; by default many.")
+        str | None, Option("--transforms", help="Elements to try, as d8*agents; by default many.")
     ] = None,
     settings: options.TaskSetOption = None,
     policy: Annotated[
-        Path | None, typer.Option("--policy", help="Also measure how symmetric this policy is.", metavar="RUN|POLICY")
+        Path | None, Option("--policy", help="Also measure how symmetric this policy is.", metavar="RUN|POLICY")
     ] = None,
     algo: options.OwnAlgoOption = None,
     network: options.OwnNetworkOption = None,
     order: options.OrderOption = None,
     rows: Annotated[
-        Path | None, typer.Option("--rows", help="Observations that a policy meets [M, D].", metavar="FILE.npy")
+        Path | None, Option("--rows", help="Observations that a policy meets [M, D].", metavar="FILE.npy")
     ] = None,
     root: options.RootOption = None,
     seconds: options.SecondsOption = 50.0,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Annotated
 
-import typer
+from typer import Option
 
 from esp_cli.commands.options import check_finite
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
@@ -22,17 +22,17 @@ EPILOG = """Examples:\n
 @study_command
 def compare_homomorphic(
     choices: StudyChoices,
-    drones: Annotated[int, typer.Option("--drones", min=2, help="N, drones.")] = 3,
-    grid: Annotated[int, typer.Option("--grid", min=3, help="Cells along each side, an odd number.")] = 7,
+    drones: Annotated[int, Option("--drones", min=2, help="N, drones.")] = 3,
+    grid: Annotated[int, Option("--grid", min=3, help="Cells along each side, an odd number.")] = 7,
     methods: Annotated[
-        str | None, typer.Option("--methods", help="Which of mpn, mpn-esp, empn, mpn-ensemble, in this order.")
+        str | None, Option("--methods", help="Which of mpn, mpn-esp, empn, mpn-ensemble, in this order.")
     ] = None,
-    group: Annotated[str, typer.Option("--group", help="The symmetry in question: c4 or d4.")] = "c4",
+    group: Annotated[str, Option("--group", help="The symmetry in question: c4 or d4.")] = "c4",
     mode: Annotated[
-        Mode | None, typer.Option("--mode", help="Which evaluations the tables state; by default stochastic.")
+        Mode | None, Option("--mode", help="Which evaluations the tables state; by default stochastic.")
     ] = None,
     threshold: Annotated[
-        float | None, typer.Option("--threshold", help="State when this return is first reached; by default 2.")
+        float | None, Option("--threshold", help="State when this return is first reached; by default 2.")
     ] = None,
 ) -> None:
     """Train standard, ESP, equivariant and averaged message passing networks on wildlife, and compare them (Fig. 6b).

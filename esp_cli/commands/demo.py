@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.text import Text
+from typer import Option
 
 from esp_cli import console
 from esp_cli.commands import options
@@ -35,7 +36,7 @@ def demo(
     task: options.TaskOption = "predator-prey",
     steps: options.StepsOption = STEPS,
     seeds: options.SeedsOption = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of both runs, the picture and the film.")] = Path(
+    out: Annotated[Path, Option("--out", "-o", help="Folder of both runs, the picture and the film.")] = Path(
         "runs/demo"
     ),
     settings: options.SetOption = None,

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument, Option
 
 from esp_cli import console
 from esp_cli.commands.check import print_elements
@@ -26,21 +26,15 @@ EPILOG = """Examples:\n
 
 def discover(
     what: Annotated[
-        str, typer.Argument(help="A task, a run folder, or an .npz file of transitions.", metavar="TASK|RUN|FILE")
+        str, Argument(help="A task, a run folder, or an .npz file of transitions.", metavar="TASK|RUN|FILE")
     ],
     task: Annotated[
         str | None,
-        typer.Option(
-            "--task", "-t", help="Task whose layout the transitions of a file have, or a run's own module:Class."
-        ),
+        Option("--task", "-t", help="Task whose layout the transitions of a file have, or a run's own module:Class."),
     ] = None,
-    transforms: Annotated[
-        str | None, typer.Option("--transforms", help="Elements to try, as d8; by default many.")
-    ] = None,
+    transforms: Annotated[str | None, Option("--transforms", help="Elements to try, as d8; by default many.")] = None,
     settings: TaskSetOption = None,
-    logs: Annotated[
-        bool, typer.Option("--logs", help="Judge from transitions alone, also where states can be set.")
-    ] = False,
+    logs: Annotated[bool, Option("--logs", help="Judge from transitions alone, also where states can be set.")] = False,
     seconds: SecondsOption = 50.0,
     json: JsonOption = None,
 ) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Option
 
 from esp_cli import console
 from esp_cli.commands import options
@@ -28,7 +28,7 @@ def evaluate(
     task: options.OwnTaskOption = None,
     episodes: Annotated[
         int | None,
-        typer.Option(
+        Option(
             "--episodes",
             "-e",
             min=1,

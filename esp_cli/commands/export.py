@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Option
 
 from esp_cli import console
 from esp_cli.commands import options
@@ -25,20 +25,18 @@ FORMATS = ("onnx", "torch", "c", "numpy")
 
 def export(
     policy: options.PolicyArgument,
-    formats: Annotated[
-        list[str], typer.Option("--format", "-f", help=f"What to write: {', '.join(FORMATS)}; repeatable.")
-    ],
+    formats: Annotated[list[str], Option("--format", "-f", help=f"What to write: {', '.join(FORMATS)}; repeatable.")],
     out: options.OutOption,
     task: options.OwnTaskOption = None,
     seed: Annotated[
-        int | None, typer.Option("--seed", help="Which seed of a run; by default the best over --episodes.")
+        int | None, Option("--seed", help="Which seed of a run; by default the best over --episodes.")
     ] = None,
     algo: options.BundledAlgoOption = None,
     network: options.OwnNetworkOption = None,
     prior: options.BundledPriorOption = None,
     episodes: Annotated[
         int | None,
-        typer.Option(
+        Option(
             "--episodes", "-e", min=2, max=1_000_000, help="Per seed, to find the best.", show_default=str(EPISODES)
         ),
     ] = None,

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
+from typer import Argument, Option
 
 from esp_cli import console
 from esp_cli.commands.options import ForceOption, JsonOption, OrderOption, RootOption, SecondsOption
@@ -29,14 +30,14 @@ _SHOWN = 4  # elements that have a column in the table; the others are in the JS
 
 
 def mirror(
-    model: Annotated[Path, typer.Argument(help="An MJCF or URDF file.", metavar="MODEL")],
+    model: Annotated[Path, Argument(help="An MJCF or URDF file.", metavar="MODEL")],
     root: RootOption = None,
     order: OrderOption = None,
     emit: Annotated[
         Literal["rsl_rl", "isaaclab", "mjlab", "skrl", "sb3", "numpy"] | None,
-        typer.Option("--emit", help="Write the mirror as a file for this loop.", metavar="HOST"),
+        Option("--emit", help="Write the mirror as a file for this loop.", metavar="HOST"),
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Path of that file.", metavar="FILE")] = None,
+    out: Annotated[Path | None, Option("--out", "-o", help="Path of that file.", metavar="FILE")] = None,
     seconds: SecondsOption = 50.0,
     force: ForceOption = False,
     json: JsonOption = None,

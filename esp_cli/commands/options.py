@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
+from typer import Argument, Option
 
 from esp_cli import console
 from esp_cli.commands.counts import parse_count, parse_seed_list, parse_seeds
@@ -150,30 +151,28 @@ def not_over_a_run(context: typer.Context, path: T) -> T:
     return path
 
 
-TaskOption = Annotated[str, typer.Option("--task", "-t", help="Task: one that `esp tasks` lists, or module:Class.")]
+TaskOption = Annotated[str, Option("--task", "-t", help="Task: one that `esp tasks` lists, or module:Class.")]
 _OWN: dict[str, Any] = {"parser": _own_class, "metavar": "MODULE:CLASS"}
 OwnTaskOption = Annotated[
-    list[str] | None, typer.Option("--task", help="Import your task, on which the run or policy was trained.", **_OWN)
+    list[str] | None, Option("--task", help="Import your task, on which the run or policy was trained.", **_OWN)
 ]
-AlgoOption = Annotated[
-    str, typer.Option("--algo", "-a", help="Learning algorithm: mappo, maddpg, qmix, or module:Class.")
-]
+AlgoOption = Annotated[str, Option("--algo", "-a", help="Learning algorithm: mappo, maddpg, qmix, or module:Class.")]
 OwnAlgoOption = Annotated[
-    list[str] | None, typer.Option("--algo", help="Import your algorithm, which trained the run.", **_OWN)
+    list[str] | None, Option("--algo", help="Import your algorithm, which trained the run.", **_OWN)
 ]
 OwnNetworkOption = Annotated[
-    list[str] | None, typer.Option("--network", help="Import your network, which the run uses.", **_OWN)
+    list[str] | None, Option("--network", help="Import your network, which the run uses.", **_OWN)
 ]
 PresetOption = Annotated[
     str,
-    typer.Option(
+    Option(
         "--preset",
         help="'default' (measured best), 'fast' (fewer seconds, more steps) or 'paper' (the paper's settings).",
     ),
 ]
 StepsOption = Annotated[
     int,
-    typer.Option(
+    Option(
         "--steps",
         "-n",
         help="Environment steps per seed, as 20000, 500k or 3M.",
@@ -187,7 +186,7 @@ if TYPE_CHECKING:
 else:  # typer trusts the parser for a plain `tuple`, but would read tuple[int, ...] as a pattern of its own
     SeedsOption = Annotated[
         tuple | None,
-        typer.Option(
+        Option(
             "--seeds",
             "-s",
             help="How many seeds to train at once: 10 means the seeds 0 to 9.",
@@ -198,22 +197,22 @@ else:  # typer trusts the parser for a plain `tuple`, but would read tuple[int, 
     ]
     SeedListOption = Annotated[
         tuple | None,
-        typer.Option(
+        Option(
             "--seed-list",
             help="Which seeds to train at once, by number, as 3,7.",
             metavar="SEEDS",
             parser=_option_parser(parse_seed_list, "SEEDS"),
         ),
     ]
-OutOption = Annotated[Path, typer.Option("--out", "-o", help="Path of the output.")]
+OutOption = Annotated[Path, Option("--out", "-o", help="Path of the output.")]
 Device = Literal["auto", "cpu", "cuda"]
 NoCheckOption = Annotated[
-    bool, typer.Option("--no-check", help="Skip the check, of at most 2 s, of a task that is not built in.")
+    bool, Option("--no-check", help="Skip the check, of at most 2 s, of a task that is not built in.")
 ]
-DeviceOption = Annotated[Device, typer.Option("--device", help="cpu, cuda, or auto: a GPU if there is one.")]
+DeviceOption = Annotated[Device, Option("--device", help="cpu, cuda, or auto: a GPU if there is one.")]
 JsonOption = Annotated[
     str | None,
-    typer.Option(
+    Option(
         "--json",
         help="Also write the result as JSON to this file; - writes it to standard output instead.",
         callback=not_over_a_run,
@@ -221,61 +220,55 @@ JsonOption = Annotated[
 ]
 SecondsOption = Annotated[
     float,
-    typer.Option(
-        "--seconds", min=1, help="Time for it; what does not fit in is not covered. Declared elements come first."
-    ),
+    Option("--seconds", min=1, help="Time for it; what does not fit in is not covered. Declared elements come first."),
 ]
 RootOption = Annotated[
-    Path | None,
-    typer.Option("--root", help="Folder that holds all files of a robot; by default its own.", metavar="DIR"),
+    Path | None, Option("--root", help="Folder that holds all files of a robot; by default its own.", metavar="DIR")
 ]
 OrderOption = Annotated[
     str | None,
-    typer.Option(
+    Option(
         "--order",
         help="Joints in your simulator's order, one a line; or a function that says what all your numbers are.",
         metavar="FILE|MODULE:NAME",
     ),
 ]
-ForceOption = Annotated[bool, typer.Option("--force", help="Overwrite existing output.")]
+ForceOption = Annotated[bool, Option("--force", help="Overwrite existing output.")]
 EpisodesOption = Annotated[
-    int, typer.Option("--episodes", "-e", min=1, max=1_000_000, help="Episodes per seed.", metavar="COUNT")
+    int, Option("--episodes", "-e", min=1, max=1_000_000, help="Episodes per seed.", metavar="COUNT")
 ]
 SetOption = Annotated[
     list[str] | None,
-    typer.Option("--set", help="Change one setting, as mappo.learning_rate=5e-4; repeatable.", metavar="NAME=VALUE"),
+    Option("--set", help="Change one setting, as mappo.learning_rate=5e-4; repeatable.", metavar="NAME=VALUE"),
 ]
 TaskSetOption = Annotated[
     list[str] | None,
-    typer.Option(
+    Option(
         "--set", help="Change one setting of the task, as task.sensor_noise_m=0.005; repeatable.", metavar="NAME=VALUE"
     ),
 ]
 PhysicsOption = Annotated[
-    str | None, typer.Option("--physics", help="Short for --set task.physics=NAME: mujoco, mujoco-3d, pymunk.")
+    str | None, Option("--physics", help="Short for --set task.physics=NAME: mujoco, mujoco-3d, pymunk.")
 ]
 TransformsOption = Annotated[
     str | None,
-    typer.Option(
-        "--transforms", help="Elements (rot90,flip-x) or a group (c4, d4) that the prior uses, or discovered."
-    ),
+    Option("--transforms", help="Elements (rot90,flip-x) or a group (c4, d4) that the prior uses, or discovered."),
 ]
 PolicyArgument = Annotated[
     Path,
-    typer.Argument(
+    Argument(
         help="Run folder, policy file, or bundled policy by its task or its name (`esp policies`).",
         metavar="RUN|POLICY",
     ),
 ]
 BundledAlgoOption = Annotated[
     str | None,
-    typer.Option(
+    Option(
         "--algo",
         "-a",
         help="Choose the bundled policy that this algorithm trained; or import module:Class, which trained the run.",
     ),
 ]
 BundledPriorOption = Annotated[
-    PriorKind | None,
-    typer.Option("--prior", help="Choose the bundled policy with this prior (none: the plain learner)."),
+    PriorKind | None, Option("--prior", help="Choose the bundled policy with this prior (none: the plain learner).")
 ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument
 
 from esp_cli import console
 from esp_cli.commands.options import JsonOption
@@ -20,7 +20,7 @@ EPILOG = """Examples:\n
 
 
 def policies(
-    task: Annotated[str | None, typer.Argument(help="List only the policies of this task.", metavar="[TASK]")] = None,
+    task: Annotated[str | None, Argument(help="List only the policies of this task.", metavar="[TASK]")] = None,
     json: JsonOption = None,
 ) -> None:
     """List the bundled policies, with the score of each and the command that trains such a run."""

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
+from typer import Argument, Option
 
 from esp_cli import console
 from esp_cli.commands import options
@@ -38,40 +39,35 @@ def render(
     out: options.OutOption,
     beside: Annotated[
         Path | None,
-        typer.Argument(help="Another policy of the same task, which plays the same episodes.", metavar="[RUN|POLICY]"),
+        Argument(help="Another policy of the same task, which plays the same episodes.", metavar="[RUN|POLICY]"),
     ] = None,
     task: options.OwnTaskOption = None,
     view: Annotated[
         Literal["auto", "top", "3d"],
-        typer.Option("--view", help="From above, or in space; auto takes the latter where the task has it."),
+        Option("--view", help="From above, or in space; auto takes the latter where the task has it."),
     ] = "auto",
     episodes: Annotated[
         int | None,
-        typer.Option(
-            "--episodes", "-e", min=1, max=100, help="Episodes of a film; by default as many as last about 8 s."
-        ),
+        Option("--episodes", "-e", min=1, max=100, help="Episodes of a film; by default as many as last about 8 s."),
     ] = None,
-    seed: Annotated[int | None, typer.Option("--seed", help="Which seed's policy acts; by default the first.")] = None,
+    seed: Annotated[int | None, Option("--seed", help="Which seed's policy acts; by default the first.")] = None,
     size: Annotated[
         int,
-        typer.Option(
+        Option(
             "--size", min=32, max=2048, help="Longer side of a scene in pixels; caption, axes and legend come on top."
         ),
     ] = 480,
     speed: Annotated[
-        float, typer.Option("--speed", parser=parse_speed, metavar="TIMES", help="Multiple of real time, as 0.5 or 4x.")
+        float, Option("--speed", parser=parse_speed, metavar="TIMES", help="Multiple of real time, as 0.5 or 4x.")
     ] = 1.0,
     fps: Annotated[
-        float | None,
-        typer.Option("--fps", min=1, max=60, help="Most frames per second: 25 unless given, in a GIF up to 50."),
+        float | None, Option("--fps", min=1, max=60, help="Most frames per second: 25 unless given, in a GIF up to 50.")
     ] = None,
     width: Annotated[
         float | None,
-        typer.Option(
-            "--width", min=20, max=1000, help="Width of a picture for print in mm, as 89: letters of 8 points."
-        ),
+        Option("--width", min=20, max=1000, help="Width of a picture for print in mm, as 89: letters of 8 points."),
     ] = None,
-    stochastic: Annotated[bool, typer.Option("--stochastic", help="Draw actions instead of the greedy ones.")] = False,
+    stochastic: Annotated[bool, Option("--stochastic", help="Draw actions instead of the greedy ones.")] = False,
     physics: options.PhysicsOption = None,
     settings: options.TaskSetOption = None,
     algo: options.BundledAlgoOption = None,

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
+from typer import Argument, Option
 
 from esp_cli import console
 from esp_cli.commands import options
@@ -30,16 +31,16 @@ def report(
     context: typer.Context,
     runs: Annotated[
         list[str],
-        typer.Argument(help="One study folder, or run folders, each as PATH or LABEL=PATH.", metavar="STUDY|RUN..."),
+        Argument(help="One study folder, or run folders, each as PATH or LABEL=PATH.", metavar="STUDY|RUN..."),
     ],
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="Folder of the page and its pictures; of a study by default STUDY/report."),
+        Option("--out", "-o", help="Folder of the page and its pictures; of a study by default STUDY/report."),
     ] = None,
-    films: Annotated[bool, typer.Option("--films", help="Draw the trained policies for the page.")] = False,
+    films: Annotated[bool, Option("--films", help="Draw the trained policies for the page.")] = False,
     results: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             "--results",
             help="Also write every seed's numbers and the configurations as JSON.",
             callback=options.not_over_a_run,
@@ -47,20 +48,20 @@ def report(
     ] = None,
     at: Annotated[
         list[str] | None,
-        typer.Option("--at", help="Runs: compare at this step; by default the last that all reached.", metavar="STEPS"),
+        Option("--at", help="Runs: compare at this step; by default the last that all reached.", metavar="STEPS"),
     ] = None,
     threshold: Annotated[
-        list[float] | None, typer.Option("--threshold", help="State when this return is first reached.")
+        list[float] | None, Option("--threshold", help="State when this return is first reached.")
     ] = None,
     mode: Annotated[
-        Mode | None, typer.Option("--mode", help="Which evaluations; greedy, unless the study is about others.")
+        Mode | None, Option("--mode", help="Which evaluations; greedy, unless the study is about others.")
     ] = None,
-    plot: Annotated[Path | None, typer.Option("--plot", help="Draw the curves as PNG and SVG.")] = None,
+    plot: Annotated[Path | None, Option("--plot", help="Draw the curves as PNG and SVG.")] = None,
     style: Annotated[
         Literal["screen", "paper"],
-        typer.Option("--style", help="Of figures; paper: as wide as a column or a page, small letters, also as PDF."),
+        Option("--style", help="Of figures; paper: as wide as a column or a page, small letters, also as PDF."),
     ] = "screen",
-    full: Annotated[bool, typer.Option("--full", help="Print every table, not only the answer.")] = False,
+    full: Annotated[bool, Option("--full", help="Print every table, not only the answer.")] = False,
     task: options.OwnTaskOption = None,
     algo: options.OwnAlgoOption = None,
     network: options.OwnNetworkOption = None,

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-import typer
+from typer import Argument, Option
 
 from esp_cli.commands import studying
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
@@ -28,7 +28,7 @@ EPILOG = """Examples:\n
 def reproduce(
     table: Annotated[
         Literal["table1", "agents", "symmetry"],
-        typer.Argument(
+        Argument(
             help="Table 1, the supplement's table for 2, 3 and 4 agents, or methods for symmetry, each tuned alike.",
             metavar="TABLE",
         ),
@@ -36,11 +36,11 @@ def reproduce(
     choices: StudyChoices,
     methods: Annotated[
         list[str] | None,
-        typer.Option("--methods", help="For symmetry: what is compared, by the names in the table; by default all."),
+        Option("--methods", help="For symmetry: what is compared, by the names in the table; by default all."),
     ] = None,
     budget: Annotated[
         int | None,
-        typer.Option("--budget", min=1, max=1000, help="For symmetry: trials of each method on each task; default 5."),
+        Option("--budget", min=1, max=1000, help="For symmetry: trials of each method on each task; default 5."),
     ] = None,
 ) -> None:
     """Train, evaluate and tabulate what a table shows; called again, it goes on where it was."""

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Argument
 
 from esp_cli import console
 from esp_cli.commands.options import JsonOption, installed_tasks
@@ -27,7 +27,7 @@ EPILOG = """Examples:\n
 def settings(
     of: Annotated[
         str | None,
-        typer.Argument(
+        Argument(
             help="Algorithm, task or network (also module:Class), 'prior' or 'evaluation'; by default all.",
             metavar="[ALGO|TASK|NETWORK]",
         ),

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import typer
+from typer import Option
 
 from esp_cli.commands import options
 from esp_cli.commands.counts import chosen_seeds, parse_count
@@ -66,15 +67,14 @@ class StudyChoices:
 
     tasks: Annotated[
         list[str] | None,
-        typer.Option("--task", "--tasks", "-t", help="Tasks, as navigation,formation; by default the paper's."),
+        Option("--task", "--tasks", "-t", help="Tasks, as navigation,formation; by default the paper's."),
     ] = None
     algos: Annotated[
-        list[str] | None,
-        typer.Option("--algo", "--algos", "-a", help="Algorithms, as mappo,qmix; by default the paper's."),
+        list[str] | None, Option("--algo", "--algos", "-a", help="Algorithms, as mappo,qmix; by default the paper's.")
     ] = None
     steps: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             "--steps",
             "-n",
             help="Environment steps per seed; several give a row each. 500k and 3M name the paper's rows, which "
@@ -84,37 +84,35 @@ class StudyChoices:
     ] = None
     seeds: StudySeedsOption = None
     seed_list: options.SeedListOption = None
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Study folder; by default runs/STUDY.")] = None
+    out: Annotated[Path | None, Option("--out", "-o", help="Study folder; by default runs/STUDY.")] = None
     preset: options.PresetOption = "default"
     settings: options.SetOption = None
     device: options.DeviceOption = "cpu"
     episodes: options.EpisodesOption = EPISODES
     jobs: Annotated[
         int | None,
-        typer.Option(
-            "--jobs", "-j", min=1, max=1000, help="Runs side by side, one thread each; by default one a core."
-        ),
+        Option("--jobs", "-j", min=1, max=1000, help="Runs side by side, one thread each; by default one a core."),
     ] = None
     engine: Annotated[
         Literal["local", "ray"],
-        typer.Option("--engine", help="What runs the study: this machine, or the nodes of a Ray cluster."),
+        Option("--engine", help="What runs the study: this machine, or the nodes of a Ray cluster."),
     ] = "local"
     address: Annotated[
         str | None,
-        typer.Option(
+        Option(
             "--address",
             help="Ray cluster, as auto or HOST:6379; by default RAY_ADDRESS, or else a new one on this machine.",
         ),
     ] = None
     gpu_share: Annotated[
-        float, typer.Option("--gpu-share", min=0.01, max=1.0, help="Share of a GPU that a run takes on a Ray cluster.")
+        float, Option("--gpu-share", min=0.01, max=1.0, help="Share of a GPU that a run takes on a Ray cluster.")
     ] = 1.0
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Say what would be run, how long it takes and what it needs; run nothing.")
+        bool, Option("--dry-run", help="Say what would be run, how long it takes and what it needs; run nothing.")
     ] = False
     reuse: Annotated[
         list[Path] | None,
-        typer.Option(
+        Option(
             "--reuse",
             help="Take finished runs of the same configuration from this study instead of training them again; may be "
             "repeated.",

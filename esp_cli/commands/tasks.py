@@ -8,7 +8,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
+from typer import Argument
 
 from esp_cli import console
 from esp_cli.commands.options import JsonOption, installed_tasks, register_named
@@ -21,7 +21,7 @@ EPILOG = """Examples:\n
 
 
 def tasks(
-    task: Annotated[str | None, typer.Argument(help="Print the card of this task.", metavar="[TASK]")] = None,
+    task: Annotated[str | None, Argument(help="Print the card of this task.", metavar="[TASK]")] = None,
     json: JsonOption = None,
 ) -> None:
     """List the tasks with their symmetries, or print the card of one task."""

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
+from typer import Option
 
 from esp_cli import console
 from esp_cli.commands import options
@@ -40,7 +41,7 @@ def train(
     preset: options.PresetOption = "default",
     prior: Annotated[
         Literal[PriorKind, "auto"] | None,
-        typer.Option(
+        Option(
             "--prior",
             help="esp: both parts; auto: as far as the task is symmetric; augment, consistency: one part; none: plain.",
         ),
@@ -49,7 +50,7 @@ def train(
     physics: options.PhysicsOption = None,
     network: Annotated[
         str | None,
-        typer.Option(
+        Option(
             "--network",
             help="mlp, gru (recurrent), set, set-equivariant, mpn (message passing), empn, equivariant or module:Class",
         ),
@@ -57,22 +58,22 @@ def train(
     steps: options.StepsOption = STEPS,
     seeds: options.SeedsOption = None,
     seed_list: options.SeedListOption = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Run folder; by default a new one in runs/.")] = None,
-    resume: Annotated[Path | None, typer.Option("--resume", help="Continue this run with its own settings.")] = None,
+    out: Annotated[Path | None, Option("--out", "-o", help="Run folder; by default a new one in runs/.")] = None,
+    resume: Annotated[Path | None, Option("--resume", help="Continue this run with its own settings.")] = None,
     device: options.DeviceOption = "cpu",
     settings: options.SetOption = None,
     config: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             "--config", help="Read settings from a run, its config.json, or a JSON or TOML file; options override them."
         ),
     ] = None,
     print_config: Annotated[
-        bool, typer.Option("--print-config", help="Print the resolved configuration as JSON; train nothing.")
+        bool, Option("--print-config", help="Print the resolved configuration as JSON; train nothing.")
     ] = False,
     init_from: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             "--init-from",
             help="Start from this policy where the shapes fit: a run, a file, or bundled.",
             metavar="RUN|POLICY",
@@ -80,15 +81,13 @@ def train(
     ] = None,
     track: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             "--track", help="Also send metrics to tensorboard, wandb or mlflow, offline in the run folder; repeatable."
         ),
     ] = None,
     watch: Annotated[
         bool,
-        typer.Option(
-            "--watch", help="Draw the curve and the current policy on a page in the run folder, for a browser."
-        ),
+        Option("--watch", help="Draw the curve and the current policy on a page in the run folder, for a browser."),
     ] = False,
     no_check: options.NoCheckOption = False,
 ) -> None:
@@ -115,12 +114,7 @@ def train(
     require(trackers)
     if prior == "none" and transforms is not None:
         raise UserError("--prior none uses no symmetry; leave out --transforms, or --prior none")
-    short = {
-        "prior.kind": prior,
-        "prior.transforms": transforms,
-        "network.name": network,
-        "task.physics": physics,
-    }
+    short = {"prior.kind": prior, "prior.transforms": transforms, "network.name": network, "task.physics": physics}
     choices: dict[str, Any] = {
         "task": task,
         "algorithm": algo,

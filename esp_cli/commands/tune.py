@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Option
 
 from esp_cli import console
 from esp_cli.commands import studying
@@ -38,19 +38,18 @@ FIRST_TRIAL_SEED = 1000  # seed of the first trial; the best settings are evalua
 )
 def tune(
     choices: StudyChoices,
-    budget: Annotated[int, typer.Option("--budget", min=1, max=100_000, help="Trials, for each prior.")] = 30,
+    budget: Annotated[int, Option("--budget", min=1, max=100_000, help="Trials, for each prior.")] = 30,
     space: Annotated[
-        Path | None,
-        typer.Option("--space", help="What to try, as JSON or TOML; by default a space for each algorithm."),
+        Path | None, Option("--space", help="What to try, as JSON or TOML; by default a space for each algorithm.")
     ] = None,
     prior: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             "--prior",
             help="esp (the default), none, auto, augment, consistency, or several as esp,none; a search each.",
         ),
     ] = None,
-    trial_seeds: Annotated[int, typer.Option("--trial-seeds", min=1, max=100, help="Seeds of each trial.")] = 3,
+    trial_seeds: Annotated[int, Option("--trial-seeds", min=1, max=100, help="Seeds of each trial.")] = 3,
 ) -> None:
     """Search for better settings; evaluate the best on fresh seeds. Called again, it goes on where it was."""
     priors = parse_names(prior) or ("esp",)
