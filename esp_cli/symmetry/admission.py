@@ -5,18 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from esp_cli.symmetry import representation
 from esp_cli.symmetry.elements import AGENTS, Element
 from esp_cli.symmetry.groups import MOST_ITEMS, Group, ProductGroup
 from esp_cli.symmetry.parse import declared_factors, is_item_name, parse_elements, rank
-from esp_cli.symmetry.representation import (
-    action_map,
-    agent_places,
-    item_places,
-    joint_sources,
-    layout_operator,
-    require_items,
-    state_operator,
-)
 from esp_envs.errors import UserError
 from esp_envs.roles import without_agents
 from esp_envs.spec import Continuous, Discrete, Items, Spaces, TaskSpec
@@ -54,7 +46,7 @@ def admit(text: str, elements: Sequence[Element] | Group, spaces: Spaces, instea
     if carried := carried_groups(spaces):
         plane = [name for name in carried if name in (*PLANE_GROUPS, scene_of(_usable(spaces), spaces.num_agents))]
         advice = f"use a group within {plane[-1]}" if plane else instead or f"use {carried[0]}"
-        if isinstance(spaces.action, Discrete) and _reason(action_map, spaces.action, moved):
+        if isinstance(spaces.action, Discrete) and _reason(representation.action_map, spaces.action, moved):
             advice = advice.replace("use ", "use continuous actions or ", 1)
     raise UserError(f"{text} cannot act on {spaces.label}: {reason}; {advice}")
 
@@ -184,7 +176,7 @@ def _require(elements: Sequence[Element], spaces: Spaces) -> None:
     declared = declares(_usable(spaces), spaces.num_agents)
     undeclared = [element for element in elements if not declared(element)]
     if isinstance(spaces.action, Discrete):
-        action_map(spaces.action, scenes)
+        representation.action_map(spaces.action, scenes)
     for element in undeclared:
         if not declared(element.in_place):
             carried = scene_of(_usable(spaces), spaces.num_agents) or "c1"
@@ -192,8 +184,8 @@ def _require(elements: Sequence[Element], spaces: Spaces) -> None:
     acted = [spaces.action.layout] if isinstance(spaces.action, Continuous) else []
     for layout in (spaces.observation, spaces.state, *acted):
         for field in layout.fields:
-            item_places(field, elements)
-        layout_operator(layout, scenes)
+            representation.item_places(field, elements)
+        representation.layout_operator(layout, scenes)
     _require_followed(elements, spaces)
     for element in undeclared:
         _require_orders(element, declared, spaces)
@@ -201,13 +193,13 @@ def _require(elements: Sequence[Element], spaces: Spaces) -> None:
 
 def _require_followed(elements: Sequence[Element], spaces: Spaces) -> None:
     """Refuse orders of agents or items that observation and state do not follow."""
-    places = agent_places(elements, spaces.num_agents)
+    places = representation.agent_places(elements, spaces.num_agents)
     if places is not None:
         if spaces.joint_fields is None and all(f.items is not Items.AGENTS for f in spaces.state.fields):
             raise UserError("its state does not say which numbers belong to which agent")
-        joint_sources(spaces.observation, places[:1])
-        state_operator(spaces, [Element(permutation=tuple(places[0].tolist()))])
-    require_items(elements, spaces)
+        representation.joint_sources(spaces.observation, places[:1])
+        representation.state_operator(spaces, [Element(permutation=tuple(places[0].tolist()))])
+    representation.require_items(elements, spaces)
     seen, held = ({field.name for field in layout.fields} for layout in (spaces.observation, spaces.state))
     for name in dict.fromkeys(name for element in elements for name, _ in element.items):
         if name in seen and name not in held and spaces.joint_fields is None:

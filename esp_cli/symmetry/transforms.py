@@ -18,19 +18,11 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from esp_cli.symmetry import representation
 from esp_cli.symmetry.admission import admitted_elements
 from esp_cli.symmetry.elements import Element
 from esp_cli.symmetry.groups import Group
 from esp_cli.symmetry.maps import Gather, Map, gather_of, map_of
-from esp_cli.symmetry.representation import (
-    Operator,
-    action_map,
-    agent_places,
-    output_operator,
-    require_items,
-    rows_operator,
-    state_operator,
-)
 from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, Layout, Spaces
 
@@ -162,14 +154,14 @@ def build_transform(
     """Stack the representations of some elements, one per seed, on a task's spaces."""
     if not elements:
         raise UserError("a transform needs one element per seed, got none")
-    require_items(elements, spaces)
-    places = agent_places(elements, spaces.num_agents)
-    image = action_map(spaces.action, elements) if isinstance(spaces.action, Discrete) else None
-    state, outputs = state_operator(spaces, elements), output_operator(spaces, elements)
-    seen = rows_operator(spaces.observation, elements, spaces.num_agents)
+    representation.require_items(elements, spaces)
+    places = representation.agent_places(elements, spaces.num_agents)
+    image = representation.action_map(spaces.action, elements) if isinstance(spaces.action, Discrete) else None
+    state, outputs = representation.state_operator(spaces, elements), representation.output_operator(spaces, elements)
+    seen = representation.rows_operator(spaces.observation, elements, spaces.num_agents)
     return Transform(
         elements=tuple(elements),
-        agents=None if places is None else gather_of(Operator.reordering(places.argsort(1)), device),
+        agents=None if places is None else gather_of(representation.Operator.reordering(places.argsort(1)), device),
         obs_map=map_of(seen, device, dtype),
         state_map=map_of(state, device, dtype),
         output_map=map_of(outputs, device, dtype) if image is None else gather_of(outputs, device),
