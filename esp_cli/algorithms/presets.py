@@ -148,10 +148,7 @@ PAPER: dict[str, dict[str, Sections]] = {"mappo": {"formation": {"mappo": {"num_
 
 
 def preset_layers(task: str, algorithm: str, preset: str, network: object = None) -> list[Sections]:
-    """Return the settings of a preset on a task, layer by layer; a later one has the last word.
-
-    `network` is the user's.
-    """
+    """Return a preset's settings on a task, layer by layer, for the user's network; a later one has the last word."""
     presets, fast = PRESETS.get(algorithm, {"default": {}}), FAST.get(algorithm, {})
     sets = SETS.get(algorithm, {}).get(task, {})
     if preset == "paper" or network not in (None, sets.get("network", {}).get("name")):

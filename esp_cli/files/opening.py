@@ -26,11 +26,8 @@ def holding(file: Path, kind: type[UserError] = LockError) -> Iterator[None]:
     """Hold the folder of a lock file, and write into the file who holds it.
 
     The kernel lets go when the process ends, however it ends. The file stays: removing it would let two processes hold
-    two files of one name.
-
-    Raises:
-        kind: another process, or this one, holds it already, or something else than a regular file is there.
-        OSError: the file system cannot lock.
+    two files of one name. An error of the `kind` says that another process, or this one, holds it already, or that
+    something else than a regular file is there; where the file system cannot lock, it is an OSError.
     """
     with ExitStack() as undo:
         with attempting("lock", file, kind):
@@ -73,10 +70,7 @@ def _holder(content: bytes) -> str:
 
 
 def open_own(path: str | os.PathLike[str], flags: int) -> int:
-    """Return a descriptor of a regular file that the program keeps in a folder of its own; it is made if missing.
-
-    A link is refused, and a pipe does not block.
-    """
+    """Return a descriptor of a regular file of our own, made if missing; a link is refused, a pipe does not block."""
     try:
         descriptor = os.open(path, flags | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, 0o666)
     except OSError as error:

@@ -69,17 +69,10 @@ def dots(
     anchors: Mapping[str, float] | None = None,
     style: Style = "screen",
 ) -> Picture:
-    """Draw the mean of each group as a dot with its interval, and every seed as a small one.
+    """Draw the mean of each group [S] as a dot with its interval, and every seed as a small one, from top to bottom.
 
-    The axis shows the groups and no zero: returns have none, and a bar that begins there would say otherwise.
-
-    Args:
-        groups: name -> one number per seed [S]; drawn from top to bottom.
-        path: where to; ``.png`` and ``.svg`` are appended, or take the place of either.
-        title: heading.
-        xlabel: what is plotted, with its convention.
-        anchors: lines where they are in view: name -> value; the legend names the others.
-        style: as of `written_figure`.
+    The axis shows the groups and no zero: returns have none, and a bar that begins there would say otherwise. Anchors
+    are lines where they are in view; the legend names the others. For path and style see `written_figure`.
     """
     with written_figure(path, (7.2, 2.1 + 0.5 * len(groups)), style) as (figure, picture):
         axes = _titled(figure, title)
@@ -124,14 +117,9 @@ def over_setting(
 ) -> Picture:
     """Draw returns over a setting as lines with intervals, and the paper's means as crosses.
 
-    Args:
-        lines: at least one: name -> value of the setting, of which there is at least one -> one number per seed [S].
-        path: where to; ``.png`` and ``.svg`` are appended, or take the place of either.
-        title: heading.
-        labels: of the axes: the setting, whose values stand at equal distances as in figure 5c, and what is plotted.
-        order: the setting's values from left to right, where not every line has all of them.
-        paper: the paper's means: name -> value of the setting -> mean.
-        style: as of `written_figure`.
+    A line has by value of the setting one number per seed [S], the paper one mean. Values stand in `order` at equal
+    distances, as in figure 5c; labels are of the setting and of what is plotted. For path and style see
+    `written_figure`.
     """
     known = dict.fromkeys(value for line in lines.values() for value in line)
     places = {value: k for k, value in enumerate(v for v in dict.fromkeys([*order, *known]) if v in known)}
@@ -169,7 +157,8 @@ def written_figure(
 ) -> Iterator[tuple[Figure, Picture]]:
     """Set up a figure of a size in inches and write it at the end, as PNG and as SVG.
 
-    For print it is a column or a page wide instead, with small letters, and a PDF too.
+    ``.png`` and ``.svg`` are appended to the path, or take the place of either. For print it is a column or a page wide
+    instead, with small letters, and a PDF too.
     """
     path = Path(path)
     stem = path.stem if path.suffix in {".png", ".svg", ".pdf"} else path.name

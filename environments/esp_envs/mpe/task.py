@@ -94,10 +94,8 @@ class ParticleTask(BatchedTask):
 
     makes_new_tensors = True
     settings: ParticleSettings
-    first_learner = 0
-    """Index of the first of the agents that learn; the task drives the others."""
-    solid: ClassVar[bool] = False
-    """Whether landmarks push agents away."""
+    first_learner = 0  # index of the first of the agents that learn; the task drives the others
+    solid: ClassVar[bool] = False  # whether landmarks push agents away
 
     def __init__(self, settings: ParticleSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
         super().__init__(settings, num_envs, generators)
