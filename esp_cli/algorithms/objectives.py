@@ -155,8 +155,7 @@ def value_loss(
     """Return the Huber loss, linear from `huber_delta` on, of values (Eq. 4), or of action values: L_TD.
 
     values [S, B (1 + copies), T, C] are of all rows, target [S, B, T, C] of the originals, which a copy shares (Prop.
-    1). With `clip_epsilon` it is the larger of this loss and that of V_old + clip(V - V_old, -eps, eps), as in the
-    MAPPO paper.
+    1). With `clip_epsilon` it is the larger of this and that of V_old + clip(V - V_old, -eps, eps) (MAPPO paper).
     """
     outputs, learned = copies.values(values), copies.learned
     mask = copies.originals.valued(outputs.count)

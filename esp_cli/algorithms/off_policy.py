@@ -163,8 +163,7 @@ class OffPolicyLearner(Learner):
         then has variance 1, so that values, and with them S_Q and c, mean about the same in every task. Mean and
         variance are those of one agent's reward; a team's, the mean of rewards of the agents' own, varies less. Where
         an episode or an agent may end early, the mean is not taken off: it would pay for each step that is still to
-        come, or charge for it. `bonus`, an entropy, is added to the value of what followed and to the lambda-return
-        from there.
+        come, or charge for it. `bonus`, an entropy, is added to value and lambda-return of what followed.
         """
         config = self.config
         last = batch.valid & ~nn.functional.pad(batch.valid[:, :, 1:], (0, 1))

@@ -58,8 +58,7 @@ def collect(
 ) -> Transitions:
     """Return the first steps of random episodes, of which one that ends earlier repeats its last transition.
 
-    After `until` no step is begun: episodes that are under way are left out, of the first ones the steps that are
-    missing.
+    After `until` no step is begun: episodes under way are left out, of the first ones only the missing steps.
     """
     worlds = env.num_envs * env.num_seeds
     rounds, count = -(-episodes // worlds), min(steps, env.spec.horizon)

@@ -37,8 +37,7 @@ def onnx_model(program: Program, description: str) -> bytes:
 
     Inputs: `observation` [rows, D]; of a recurrent policy `memory` [rows, H]; of one with masks `action_mask` [rows, A]
     bool; of a network over sets `set_NAME` [rows, K, W]. Outputs: `action` ([rows] int64 or [rows, width] float32),
-    `outputs` [rows, outputs] of the last layer, and `memory_out` [rows, H]. A team's rows stand side by side, world
-    after world.
+    `outputs` [rows, outputs] of the last layer, and `memory_out` [rows, H]. A team's rows stand side by side.
 
     The description, which is JSON, goes into the model's metadata.
     """

@@ -1,8 +1,7 @@
 """Policies at originals and at copies of them, in one frame, with the slopes of what losses are made of.
 
 Shape letters: S seeds, P parts (the originals and K copies of them), R rows of a part (B scenes, T steps, N agents), A
-actions, W numbers of a continuous action. The first L parts are those that a learner's own loss takes: all, or the
-originals.
+actions, W numbers of a continuous action. The first L parts are those that a learner's loss takes: all, or originals.
 """
 
 from __future__ import annotations

@@ -118,8 +118,7 @@ def over_setting(
     """Draw returns over a setting as lines with intervals, and the paper's means as crosses.
 
     A line has by value of the setting one number per seed [S], the paper one mean. Values stand in `order` at equal
-    distances, as in figure 5c; labels are of the setting and of what is plotted. For path and style see
-    `written_figure`.
+    distances, as in figure 5c; labels are of the setting and the plot. For the path see `written_figure`.
     """
     known = dict.fromkeys(value for line in lines.values() for value in line)
     places = {value: k for k, value in enumerate(v for v in dict.fromkeys([*order, *known]) if v in known)}

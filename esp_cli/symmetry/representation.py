@@ -1,7 +1,6 @@
 """What elements do to the numbers of a task: observations and states to L_g, actions to K_g.
 
-Layouts say how the numbers of one row transform; here agents change places too. Whatever cannot is refused by a
-`UserError` that says why.
+Layouts say how the numbers of one row transform; here agents change places too. What cannot is refused.
 """
 
 from __future__ import annotations

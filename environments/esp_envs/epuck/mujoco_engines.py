@@ -174,9 +174,8 @@ class MujocoSpatial(MujocoWorlds):
 
     An e-puck stands on two driven wheels and two casters. Wheels are spheres: cylinders on an edge spin the robot 9 to
     24 % too slowly. Contacts with the floor have elliptic friction cones, which look the same from every direction.
-    Between robots, walls and pillars a robot is a sphere at half its height: a capsule would touch another at its
-    upper or its lower end depending on the last bit of their tilt, and a sphere touches where the middle of an upright
-    cylinder does.
+    Between robots, walls and pillars a robot is a sphere at half its height: a capsule would touch another at its upper
+    or its lower end by the last bit of their tilt, a sphere touches where the middle of a cylinder does.
     """
 
     def _model(self, arena: Arena) -> mujoco.MjModel:

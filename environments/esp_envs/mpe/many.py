@@ -18,8 +18,7 @@ class ManyWorlds(ParticleWorlds):
 
     Each of the `crowd` first agents sees as many nearest others of the crowd, and landmarks, as `sees` says; 0 for all.
     `touching` [A, W'] counts the agents that touch each, `squared_to_landmarks` [L, W'] is from each landmark to its
-    nearest agent, and `seen_agents` and `seen_landmarks` [W, crowd, k] are indices by distance, None where all are
-    seen.
+    nearest agent, and `seen_agents` and `seen_landmarks` [W, crowd, k] are indices by distance, or None for all.
     """
 
     def __init__(

@@ -12,8 +12,7 @@ One step of MPE (Lowe et al. 2017, `multiagent/core.py`), which is what papers o
 
 The package that keeps MPE alive (mpe2) moves the position first, by the old velocity, so that an action shows one step
 later; `velocity_first=False` does the same. Two bodies that collide push each other apart along the line between their
-centres with CONTACT_FORCE * CONTACT_MARGIN * softplus(-gap / CONTACT_MARGIN), where `gap` is the distance between their
-rims.
+centres with CONTACT_FORCE * CONTACT_MARGIN * softplus(-gap / CONTACT_MARGIN), with the `gap` of their rims.
 """
 
 from __future__ import annotations
@@ -64,8 +63,7 @@ class ParticleWorlds:
     positions, of which `velocity`, `position` and `entity` are views; W' is W padded up (see LANE_MULTIPLE). Code that
     writes to it calls `measure` afterwards, for `squared_contact_distance` [contacts, W'] and
     `squared_watched_distance` [watched, W'] of the pairs in `bodies`. `pushes` [A, contacts] are 1 and -1 where an
-    agent is the first or the second of a pair. All of these stay the same memory for good, so that a task may keep
-    views of them.
+    agent is the first or the second of a pair. All stay the same memory, so that a task may keep views.
     """
 
     def __init__(self, bodies: Bodies, num_worlds: int, device: torch.device, velocity_first: bool = True) -> None:
