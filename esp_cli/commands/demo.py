@@ -122,7 +122,7 @@ def _show(folder: StudyFolder) -> None:
     from esp_cli.training.build import build_environment
 
     material, out = collect_study(folder), folder.path
-    picture, _ = study_figures.draw_curves(material, out / CURVES)
+    picture = study_figures.draw_curves(material, out / CURVES)
     console.note(f"curves -> {picture.png}")
     trained = [TrainedPolicy.read(folder.run_path(cell)) for cell in folder.study.cells]
     if build_environment(trained[0].config.of_one_seed(), 1, "film").has("scene"):

@@ -92,7 +92,7 @@ def report(
     if plot is not None:
         from esp_cli.reporting.study_figures import draw_curves
 
-        picture, _ = draw_curves(material, plot, style)
+        picture = draw_curves(material, plot, style)
         for file in (picture.png, picture.svg, *([picture.svg.with_suffix(".pdf")] if style == "paper" else [])):
             console.note(f"curves -> {file}")
     console.result(json, material.results.document(statistics=True), lambda: print_answer(material, full))

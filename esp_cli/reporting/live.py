@@ -44,7 +44,7 @@ class LivePage:
         curve = read_curve(trainer.folder.path, None, "greedy")
         with TemporaryDirectory() as scratch:
             ylabel = f"greedy return ({spec.convention})"
-            picture, _ = learning_curves([Panel(spec.name, [curve])], Path(scratch) / "curve", ylabel)
+            picture = learning_curves([Panel(spec.name, [curve])], Path(scratch) / "curve", ylabel)
             svg = picture.svg.read_bytes()
             if trainer.evaluation_worlds.has("scene"):
                 drawn = Path(scratch) / "film.gif"

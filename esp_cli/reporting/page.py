@@ -10,7 +10,6 @@ import os
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -51,7 +50,7 @@ def write_report(material: Material, out: Path, style: Style = "screen") -> list
     out.mkdir(parents=True, exist_ok=True)
     # Names in this folder are the program's own: links there are replaced, where drawing would follow them.
     with TemporaryDirectory() as scratch:
-        curves, hovers = draw_curves(material, Path(scratch) / CURVES, style=style)
+        curves = draw_curves(material, Path(scratch) / CURVES, style=style)
         pictures = [curves, *draw_variants(material.results, Path(scratch), style)]
         images = [(picture.png.stem, data_uri(picture.svg.read_bytes(), "image/svg+xml")) for picture in pictures]
         for file in sorted(Path(scratch).iterdir()):
@@ -75,7 +74,6 @@ def write_report(material: Material, out: Path, style: Style = "screen") -> list
         "answer": answer(material),
         "tables": tables,
         "size": curves.size,
-        "hovers": [asdict(hover) for hover in hovers],
         "curves": images[0][1],
         "pictures": images[1:],
         "films": films,

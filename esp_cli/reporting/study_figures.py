@@ -11,13 +11,11 @@ from textwrap import fill
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from esp_cli.policies.statistics import Floats, curve_band
+from esp_cli.policies.statistics import curve_band
 from esp_cli.reporting.collect import Material, RunCurve
 from esp_cli.reporting.figures import (
-    POINTS_PER_INCH,
     Picture,
     Style,
     appearance,
@@ -35,7 +33,6 @@ _MAX_COLUMNS = 3
 _LABEL_CHARACTERS = 44  # of one line beside the vertical axis
 _BELOW_RANDOM = 0.15  # how far below the random policy a panel of curves goes, as a share of what is above it
 _NAME_HEIGHT = 0.05  # height of a level's name as a share of a panel
-_MAX_HOVERED = 200  # evaluations of a curve whose values a page shows; those of longer curves are thinned out
 
 
 @dataclass(frozen=True)
@@ -65,7 +62,7 @@ def series_of(results: Results) -> list[Series]:
     return [Series(name, setting, cells) for (name, setting), cells in whole.items()]
 
 
-def draw_curves(material: Material, path: Path, style: Style = "screen") -> tuple[Picture, tuple[Hover, ...]]:
+def draw_curves(material: Material, path: Path, style: Style = "screen") -> Picture:
     """Draw the learning curves by panel, with the anchors of a run that has its final evaluation."""
     entries = {entry.name: entry for entry in material.results.cells}
     panels: dict[tuple[int, ...], Panel] = {}
@@ -134,33 +131,19 @@ class Panel:
     anchors: Mapping[str, float] = field(default_factory=dict)  # dotted lines where they are in view: name -> value
 
 
-@dataclass(frozen=True)
-class Hover:
-    """What a page shows where the pointer is over a panel; lengths are points of the SVG from its upper left corner."""
-
-    box: tuple[float, float, float, float]  # left, top, right and bottom of the axes
-    # label, colour, and [x, y, step, mean, low, high] of each evaluation
-    curves: tuple[tuple[str, str, list[list[float]]], ...]
-
-
 def learning_curves(
     panels: Sequence[Panel], path: str | os.PathLike[str], ylabel: str, style: Style = "screen"
-) -> tuple[Picture, tuple[Hover, ...]]:
-    """Draw means over seeds with their 95 % bootstrap intervals, in panels with one legend, as in the paper's figure 4.
-
-    Returns:
-        The files, and for each panel what a page shows beside the pointer.
-    """
+) -> Picture:
+    """Draw means over seeds with their 95 % bootstrap intervals, in panels with one legend, as in figure 4."""
     labels = list(dict.fromkeys(curve.label for panel in panels for curve in panel.curves))
     columns = min(len(panels), _MAX_COLUMNS)
     rows = math.ceil(len(panels) / columns)
     width, height = _ONE_PANEL if len(panels) == 1 else _PANEL
     with written_figure(path, (max(columns * width, 6.0), rows * height + _LEGEND_INCHES), style) as (figure, picture):
         grid = figure.subplots(rows, columns, squeeze=False)
-        drawn = []
         for axes, panel in zip(grid.flat, panels, strict=False):
-            bands = [_draw_curve(axes, curve, labels.index(curve.label)) for curve in panel.curves]
-            drawn.append((axes, panel, bands))
+            for curve in panel.curves:
+                _draw_curve(axes, curve, labels.index(curve.label))
             _draw_levels(axes, panel)
             axes.set_title(panel.title, loc="left", fontweight="bold")
             axes.set_xlabel("environment steps per seed")
@@ -178,8 +161,7 @@ def learning_curves(
             ncols=min(len(labels), 2 * columns),
             title=caption(counts),
         )
-    hovers = tuple(_hover(figure, axes, panel, labels, bands) for axes, panel, bands in drawn)
-    return picture, hovers
+    return picture
 
 
 def _finished(results: Results) -> dict[str, dict[str, CellResult]]:
@@ -190,8 +172,7 @@ def _finished(results: Results) -> dict[str, dict[str, CellResult]]:
     return finished
 
 
-def _draw_curve(axes: Axes, curve: RunCurve, index: int) -> Floats:
-    """Draw a curve with its band, and return step, mean and both edges of each evaluation [K, 4]."""
+def _draw_curve(axes: Axes, curve: RunCurve, index: int) -> None:
     mean, low, high = curve_band(curve.values)
     steps = np.asarray(curve.steps, dtype=np.float64)
     colour, style = appearance(index)
@@ -199,7 +180,6 @@ def _draw_curve(axes: Axes, curve: RunCurve, index: int) -> Floats:
     axes.plot(steps, mean, color=colour, linestyle=style, linewidth=1.8, marker=marker, label=curve.label)
     if np.shape(curve.values)[1] > 1:
         axes.fill_between(steps, low, high, color=colour, alpha=0.18, linewidth=0)
-    return np.stack([steps, mean, low, high], axis=1)
 
 
 def _draw_levels(axes: Axes, panel: Panel) -> None:
@@ -218,19 +198,3 @@ def _draw_levels(axes: Axes, panel: Panel) -> None:
         axes.annotate(name, (1.0, value), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=7)
     for value, _ in levels:
         axes.axhline(value, linestyle=":", color="#777777", linewidth=1.0, zorder=1)
-
-
-def _hover(figure: Figure, axes: Axes, panel: Panel, labels: Sequence[str], bands: Sequence[Floats]) -> Hover:
-    """Return where the evaluations of a panel lie, once the figure is written and so laid out."""
-    scale, height = POINTS_PER_INCH / figure.dpi, figure.get_figheight() * POINTS_PER_INCH
-    left, bottom, right, top = (float(edge) * scale for edge in axes.bbox.extents)
-    curves = []
-    for curve, band in zip(panel.curves, bands, strict=True):
-        every = math.ceil(len(band) / _MAX_HOVERED)
-        kept = band[sorted({*range(0, len(band), every), len(band) - 1})]
-        kept = kept[np.isfinite(kept).all(axis=1)]
-        places = axes.transData.transform(kept[:, :2]).reshape(-1, 2) * scale
-        places[:, 1] = height - places[:, 1]
-        points = np.concatenate([places, kept], axis=1).round(2).tolist()
-        curves.append((curve.label, appearance(labels.index(curve.label))[0], points))
-    return Hover((left, height - top, right, height - bottom), tuple(curves))

@@ -173,7 +173,7 @@ def test_a_run_of_a_gpu_is_compared_where_there_is_none():
 
 def test_the_picture_shows_the_curves(tmp_path):
     curves = [curve(PLAIN, "plain"), curve(ESP, "ESP")]
-    picture, _ = draw_curves(gathered(curves, [100, 200]), tmp_path / "curves.png")
+    picture = draw_curves(gathered(curves, [100, 200]), tmp_path / "curves.png")
     with Image.open(picture.png) as image:
         assert image.format == "PNG"
     text = picture.svg.read_text()

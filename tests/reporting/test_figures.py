@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections import namedtuple
 from xml.etree import ElementTree
 
@@ -44,13 +43,13 @@ def drawn(monkeypatch):
 
 def draw(curves, path, **lines):
     """Draw one panel; returns the files."""
-    picture, _ = learning_curves([Panel("a panel", curves, **lines)], path, "return")
+    picture = learning_curves([Panel("a panel", curves, **lines)], path, "return")
     return picture.png, picture.svg
 
 
 def draw_curves(path, lines=None):
     panel = Panel("navigation", CURVES, lines or {"random": -200.4, "heuristic": -129.0, "paper": -130.22})
-    picture, _ = learning_curves([panel], path, "return, convention esp")
+    picture = learning_curves([panel], path, "return, convention esp")
     return picture.png, picture.svg
 
 
@@ -173,7 +172,7 @@ def test_what_cannot_be_drawn_is_one_sentence_and_no_file(tmp_path, draw, text):
 
 def test_panels_share_a_legend_and_each_has_its_title_and_anchors(tmp_path):
     panels = [Panel("navigation, 500k", [RISING, FLAT], {"random": 1.0, "far off": 99.0}), Panel("formation", [FLAT])]
-    picture, _ = learning_curves(panels, tmp_path / "curves.png", "greedy return")
+    picture = learning_curves(panels, tmp_path / "curves.png", "greedy return")
     text = picture.svg.read_text()
     assert all(part in text for part in ("navigation, 500k", "formation", "greedy return", "random"))
     assert "far off" not in text, "it would squeeze the curves"
@@ -208,33 +207,3 @@ def test_the_settings_values_stand_in_their_order_though_no_line_has_all(tmp_pat
         places = [text.index(f"<!-- {name} -->") for name in ("c = 0", "c = 1", "c = 0.5")]
         assert [sorted(places).index(place) for place in places] == expected
         assert "c = 0.1" not in text
-
-
-def test_the_pointer_is_shown_the_evaluations_where_they_were_drawn(tmp_path, drawn):
-    panels = [Panel("p", [RISING]), Panel("q", [FLAT, RISING])]
-    picture, (hover, other) = learning_curves(panels, tmp_path / "a", "return")
-    ((label, colour, points),) = hover.curves
-    assert (label, colour, [curve[1] for curve in other.curves]) == ("MAPPO", COLORS[0], [COLORS[1], COLORS[0]])
-    # two seeds lie 1 apart, so that their interval is from one to the other
-    assert [point[2:] for point in points] == [[0, 0.5, 0, 1], [100, 2.5, 2, 3], [200, 4.5, 4, 5]]
-    (path,) = re.findall(
-        r'<path d="([^"]*)" clip-path="[^"]*" style="fill: none; stroke: #0072b2; stroke-width: 1.8;? ?[^"]*"',
-        picture.svg.read_text(),
-    )[:1]
-    line = [float(number) for number in re.findall(r"[\d.]+", path)]
-    assert [*zip(line[::2], line[1::2], strict=True)] == [
-        (pytest.approx(x, abs=0.1), pytest.approx(y, abs=0.1)) for x, y, *_ in points
-    ]
-    left, top, right, bottom = hover.box
-    assert left < points[0][0] < points[2][0] < right < other.box[0]
-    assert top < points[2][1] < points[0][1] < bottom
-    assert picture.size == (8.0 * 72, 4.0 * 72)
-
-
-def test_the_pointer_skips_what_is_not_finite_and_a_long_curve_is_thinned(tmp_path):
-    broken = Curve("a", [0, 1, 2], [[1.0, 1.0], [np.nan, 2.0], [3.0, 3.0]])
-    long = Curve("b", np.arange(1001), np.arange(1001.0)[:, None])
-    _, (hover,) = learning_curves([Panel("p", [broken, long])], tmp_path / "a", "y")
-    points = [[point[2] for point in points] for _, _, points in hover.curves]
-    assert points[0] == [0, 2]
-    assert (len(points[1]), points[1][-1]) == (168, 1000), "every sixth of 1001, and the last"
