@@ -31,7 +31,7 @@ class StudyProgress:
 
     def __enter__(self) -> StudyProgress:
         if (live := console.live_progress()) is not None:
-            self._total, self._live = live.add_task("whole study", total=1.0, status=[]), live
+            self._total, self._live = live.add_task("", total=1.0, status="whole study"), live
             live.start()
         return self
 
@@ -70,13 +70,13 @@ class StudyProgress:
         for run in snapshot.runs:
             name = run.cell.name
             if run.is_active and name not in self._bars:
-                self._bars[name] = live.add_task(name, total=run.cell.config.steps, status=[])
+                self._bars[name] = live.add_task("", total=run.cell.config.steps, status=name)
             if name in self._bars:
                 if run.is_active:
-                    live.update(self._bars[name], completed=run.step, status=[run_status(run)])
+                    live.update(self._bars[name], completed=run.step, status=f"{run_status(run)}  {name}")
                 else:
                     live.remove_task(self._bars.pop(name))
-        live.update(self._total, completed=share(snapshot), status=[whole_status(snapshot)])
+        live.update(self._total, completed=share(snapshot), status=f"{whole_status(snapshot)}  whole study")
 
 
 def share(snapshot: Snapshot) -> float:

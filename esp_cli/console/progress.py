@@ -6,12 +6,13 @@ import math
 import signal
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from types import FrameType
 
 from rich.console import RenderableType
-from rich.progress import Progress, ProgressColumn, Task
+from rich.progress import BarColumn, Progress, TextColumn
+from rich.table import Column
 from rich.text import Text
 
 from esp_cli.console.streams import err, note
@@ -19,32 +20,6 @@ from esp_cli.files.formatting import format_count, format_duration, format_rate
 
 LINE_INTERVAL_S = 10.0  # seconds between two plain progress lines where standard error is no terminal
 RATE_WINDOW_S = 30.0  # seconds over which the shown rate is averaged
-_WIDEST_BAR = 40
-
-
-def progress_line(description: str, share: float, status: Sequence[str], width: int) -> str:
-    """Return a line of at most `width` characters; what matters least goes first."""
-    shown = "  ".join(status[:2])
-    head = f"{description} " if len(description) + 1 + len(shown) <= width else ""
-    for item in status[2:]:
-        if len(head) + len(shown) + 2 + len(item) <= width:
-            shown += f"  {item}"
-    bar = min(_WIDEST_BAR, width - len(head) - len(shown) - 2)
-    if bar >= 5:
-        done = round(bar * min(max(share, 0.0), 1.0))
-        head += f"{'━' * done}{'╌' * (bar - done)}  "
-    return head + shown
-
-
-class LineColumn(ProgressColumn):
-    """The whole line of a task, fitted to the terminal; its status is a list in the task's field `status`."""
-
-    max_refresh = None
-
-    def render(self, task: Task) -> Text:
-        share = task.completed / task.total if task.total else 1.0
-        width = err.width - 1
-        return Text(progress_line(task.description, share, task.fields["status"], width), no_wrap=True, overflow="crop")
 
 
 class LiveProgress(Progress):
@@ -59,8 +34,12 @@ class LiveProgress(Progress):
 
 
 def live_progress() -> LiveProgress | None:
-    """Return a live display, or None where standard error is no terminal."""
-    return LiveProgress(LineColumn(), console=err) if err.is_terminal else None
+    """Return a live display of each task's field `status` and a bar, or None where standard error is no terminal.
+
+    On a narrow terminal the bar shrinks first, then the status loses its end.
+    """
+    status = TextColumn("{task.fields[status]}", markup=False, table_column=Column(no_wrap=True, overflow="ellipsis"))
+    return LiveProgress(status, BarColumn(), console=err) if err.is_terminal else None
 
 
 class TrainingProgress:
@@ -100,7 +79,7 @@ class TrainingProgress:
         self._history.append((self._begin_s, self._start))
         self._live = live_progress()
         if self._live is not None:
-            self._task = self._live.add_task(self.description, total=self.total, completed=self._start, status=[])
+            self._task = self._live.add_task("", total=self.total, completed=self._start, status=self.description)
             self._live.start()
         return self
 
@@ -119,7 +98,7 @@ class TrainingProgress:
         while len(self._history) > 2 and now - self._history[1][0] >= RATE_WINDOW_S:
             self._history.popleft()
         if self._live is not None:
-            self._live.update(self._task, completed=done, status=self.parts())
+            self._live.update(self._task, completed=done, status="  ".join([self.description, *self.parts()]))
         elif now - self._last_line_s >= LINE_INTERVAL_S:
             self._last_line_s = now
             self._print_line()

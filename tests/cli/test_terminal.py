@@ -23,8 +23,7 @@ from typer.testing import CliRunner
 from esp_cli import console
 from esp_cli.app import app, build_command
 from esp_cli.commands import COMMANDS
-from esp_cli.console import lay_out, streams
-from esp_cli.console.progress import progress_line
+from esp_cli.console import lay_out, progress, streams
 from esp_cli.policies.bundled import read_bundled
 from tests.cli.running import TINY_OPTIONS, esp
 
@@ -58,15 +57,20 @@ def test_a_table_that_fits_has_lines_and_one_that_cannot_is_a_block_per_row() ->
     assert len(lay_out(COLUMNS, ROWS, Console(width=44))) > 3
 
 
-@pytest.mark.parametrize("description", ["formation", "a-task-with-a-rather-long-name"])
-def test_the_progress_line_keeps_step_rate_time_and_return_at_80_columns(description: str) -> None:
-    status = ["12.8k/1.25M  9.51k steps/s  12 h 03 min left", "greedy -131.4", "return -140.2", "entropy 1.204"]
-    line = progress_line(description, 0.25, status, 80)
-    assert len(line) <= 80
-    assert "12.8k/1.25M  9.51k steps/s  12 h 03 min left  greedy -131.4" in line
-    wide = progress_line(description, 0.25, status, 140)
-    assert all(item in wide for item in (description, *status))
-    assert wide.count("━") == pytest.approx((wide.count("━") + wide.count("╌")) / 4, abs=1)
+@pytest.mark.parametrize(("width", "bar"), [(140, 10), (90, 7), (60, 0), (30, 0)])
+def test_a_narrow_terminal_shortens_the_bar_before_step_rate_and_time(
+    width: int, bar: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    screen = Console(width=width, force_terminal=True, color_system=None, highlight=False)
+    monkeypatch.setattr(progress, "err", screen)
+    live = progress.live_progress()
+    status = "formation  12.8k/1.25M  9.51k steps/s  12 h 03 min left  [b]"
+    live.add_task("", total=4, completed=1, status=status)
+    screen.print(live.get_renderable())
+    (line,) = capsys.readouterr().out.splitlines()
+    assert len(line.rstrip()) <= width
+    assert line.startswith(status if width > 60 else status[: width - 2])
+    assert line.count("━") == bar, "a quarter is done"
 
 
 def at_80(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> list[str]:
