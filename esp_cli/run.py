@@ -181,7 +181,7 @@ def plan(
     preset: str,
     settings: Mapping[str, object] | None,
     device: str,
-    init_from: str | os.PathLike[str] | Start | None,
+    init_from: str | os.PathLike[str] | None,
 ) -> tuple[RunConfig, dict[str, Tensor] | None]:
     """Return the configuration of a new run and its first weights, as `train`; refuse what does not go together."""
     if isinstance(seeds, int):
@@ -190,8 +190,7 @@ def plan(
     learner = build_learner(config)
     if init_from is None:
         return config, None
-    start = init_from if isinstance(init_from, Start) else Start.open(init_from)
-    initial, weights = start.fit(learner)
+    initial, weights = Start.open(init_from).fit(learner)
     return config.model_copy(update={"init_from": initial}), weights
 
 

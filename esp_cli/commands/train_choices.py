@@ -15,7 +15,6 @@ from esp_envs.errors import UserError
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from esp_cli.policies.loading import Start
     from esp_cli.training.config import RunConfig
 
 _PARAMETERS = {"algorithm": "algo"}  # names of parameters that differ from those in a file
@@ -49,57 +48,34 @@ def _with_file(
     named = {name for name in given if was_given(context, _PARAMETERS.get(name, name))}
     named |= {"seeds"} if was_given(context, "seed_list") else set()
     if file.config is not None:
-        for name in ("task", "algorithm", "preset"):
-            if name in named and given[name] != file.choices[name]:
+        own = file.choices | {"network": file.config.network.name}
+        asked = {name: given[name] for name in named} | {"network": settings.get("network.name", own["network"])}
+        for name in ("task", "algorithm", "preset", "network"):
+            if asked.get(name, own[name]) != own[name]:
                 flag = _flag(name)
                 raise UserError(
-                    f"{path} holds every setting of a run with {flag} {file.choices[name]}; leave {flag} out, "
+                    f"{path} holds every setting of a run with {flag} {own[name]}; leave {flag} out, "
                     "or name a file with only what differs"
                 )
     filled = {name: _read(path, name, value) for name, value in file.choices.items() if name not in named}
-    if file.config is not None and "init_from" in filled:
-        filled["init_from"] = _start_of(path, file.config, filled["init_from"])
     kept = file.settings
     if settings.get("prior.kind") == "auto":  # says these by itself
         kept = {name: value for name, value in kept.items() if name.removeprefix("prior.") not in SAID_BY_AUTO}
-    if file.config is not None:
-        kept = _fitting(kept, settings)
+    changed = any(name.startswith("task.") and kept.get(name) != value for name, value in settings.items())
+    if file.config is not None and changed:
+        kept = _unmeasured(kept)
     chosen = set(settings) if file.config is not None else {*kept, *settings}
     return given | filled, kept | settings, chosen
 
 
-def _fitting(kept: Mapping[str, object], settings: Mapping[str, object]) -> dict[str, object]:
-    """Return the settings of a whole run without those that the user's other network or task makes void."""
-    left = dict(kept)
-    if "network.name" in settings:
-        from esp_cli.networks.build import network_class
+def _unmeasured(kept: Mapping[str, object]) -> dict[str, object]:
+    """Return the settings of a run without what was measured in its task, for another one."""
+    from esp_cli.symmetry.admission import DISCOVERED
 
-        known = {f"network.{name}" for name in network_class(settings["network.name"]).model_fields}
-        left = {name: value for name, value in left.items() if not name.startswith("network.") or name in known}
-    if any(name.startswith("task.") and kept.get(name) != value for name, value in settings.items()):
-        from esp_cli.symmetry.admission import DISCOVERED
-
-        left.pop("prior.weights", None)
-        if str(left.get("prior.transforms")).startswith(DISCOVERED):
-            left["prior.transforms"] = DISCOVERED.rstrip(":")
+    left = {name: value for name, value in kept.items() if name != "prior.weights"}
+    if str(left.get("prior.transforms")).startswith(DISCOVERED):
+        left["prior.transforms"] = DISCOVERED.rstrip(":")
     return left
-
-
-def _start_of(path: Path, config: RunConfig, source: str) -> Start:
-    """Return the weights that a run started from: the copy in its folder, or the policy if that is still the same."""
-    from esp_cli.policies.loading import Start
-
-    if path.is_dir() and (own := Start.find_copy(path, config)) is not None:
-        return own
-    started = f"the run of {path} started from the policy {source}"
-    try:
-        start = Start.open(source)
-    except UserError:
-        raise UserError(f"{started}, which cannot be read here; add --init-from POLICY") from None
-    if not start.matches(config):
-        folder = "" if path.is_dir() else ", or name the folder of the run, which holds a copy"
-        raise UserError(f"{started}, which holds other weights now; add --init-from POLICY{folder}")
-    return start
 
 
 def _read(path: Path, name: str, value: Any) -> Any:

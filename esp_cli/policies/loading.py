@@ -25,7 +25,7 @@ from esp_cli.networks.policy import Policy
 from esp_cli.networks.roles import RolesPolicy
 from esp_cli.policies import bundled
 from esp_cli.training.build import build_environment, generators, spec_of
-from esp_cli.training.checkpoint import CheckpointError, digest, read_initial, read_policy
+from esp_cli.training.checkpoint import digest, read_policy
 from esp_cli.training.config import InitialPolicy, RunConfig, resolve_task_settings
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.settings import parse_config
@@ -177,19 +177,6 @@ class Start:
         weights = {**trained.policy.state_dict(), **trained.further}
         return cls(os.fspath(source), trained.source, trained.config, weights)
 
-    @classmethod
-    def find_copy(cls, folder: Path, config: RunConfig) -> Start | None:
-        """Return the copy in the folder of a run; None where the run started from nothing, or its copy is damaged."""
-        if config.init_from is None:
-            return None
-        try:
-            weights = read_initial(RunFolder.open(folder).initial_path, config.init_from)
-        except CheckpointError:
-            return None
-        if all(torch.equal(tensor, tensor[:1].expand_as(tensor)) for tensor in weights.values()):
-            weights = {name: tensor[:1] for name, tensor in weights.items()}
-        return cls(config.init_from.source, folder, config, weights)
-
     def fit(self, learner: Learner) -> tuple[InitialPolicy, dict[str, Tensor]]:
         """Return what a new run's configuration records of this start, and the weights [S, ...] for its learner."""
         seeds, own, given = learner.policy.num_seeds, learner.policy.state_dict(), dict(self.weights)
@@ -217,13 +204,6 @@ class Start:
                 )
         weights = _repeated({**given, **fitting}, seeds)
         return InitialPolicy(source=self.source, sha256=digest(weights, {})), weights
-
-    def matches(self, config: RunConfig) -> bool:
-        """Return whether these are the weights that the run of a configuration started from."""
-        seeds, start = len(config.seeds), config.init_from
-        if start is None or self._num_seeds not in (1, seeds):
-            return False
-        return digest(_repeated(self.weights, seeds), {}) == start.sha256
 
     @property
     def _num_seeds(self) -> int:

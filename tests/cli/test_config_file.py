@@ -53,14 +53,6 @@ def test_what_was_measured_in_a_task_is_measured_anew_in_a_changed_one(tmp_path:
     assert "rot90" not in changed["weights"]
 
 
-def test_another_network_takes_the_settings_that_it_has(tmp_path: Path) -> None:
-    perceptron = ["--network", "mlp", "--set", "network.hidden=[32,32]", "--set", "network.precision=bfloat16"]
-    whole = printed(*perceptron, "--steps", "20k")
-    network = printed("--config", written(tmp_path / "c.json", whole), "--network", "equivariant")["network"]
-    assert (network["name"], network["hidden"]) == ("equivariant", [32, 32])
-    assert "precision" not in network
-
-
 def test_weights_of_elements_are_a_value_in_a_small_file(tmp_path: Path) -> None:
     prior = {"transforms": "rot90,rot180", "trust": "measured", "weights": {"rot90": 0.5, "rot180": 1.0}}
     small = written(tmp_path / "c.json", {"task": "navigation", "prior": prior})
@@ -155,11 +147,14 @@ def test_wrong_toml_is_one_sentence(tmp_path: Path, content: str, sentence: str)
     assert sentence in refused("train", "--config", written(tmp_path / "c.toml", content))
 
 
-def test_a_whole_configuration_does_not_take_another_learner_task_or_preset(finished: Path, tmp_path: Path) -> None:
+def test_a_whole_configuration_does_not_take_another_learner_task_preset_or_network(
+    finished: Path, tmp_path: Path
+) -> None:
     for flag, value, own in (
         ("--algo", "qmix", "mappo"),
         ("--task", "formation", "navigation"),
         ("--preset", "paper", "default"),
+        ("--network", "equivariant", "mlp"),
     ):
         sentence = refused("train", "--config", finished, flag, value, "--out", tmp_path / "run")
         assert f"holds every setting of a run with {flag} {own}; leave {flag} out" in sentence
