@@ -45,17 +45,6 @@ def test_all_methods_are_trained_and_compared_as_any_study(tmp_path: Path) -> No
         assert [passed["threshold"] for passed in cell["steps_to"]] == [2.0]
         assert {**result["config"], **cell["config"]}["task_settings.num_agents"] == 2
     assert "FLOPs an action" in first.stdout
-    metrics = (out / "runs" / "wildlife-mappo-64-empn" / "metrics.jsonl").read_bytes()
-    again = esp(*command)
-    assert again.stdout == first.stdout
-    assert "4 of them finished" in again.stderr
-    assert (out / "runs" / "wildlife-mappo-64-empn" / "metrics.jsonl").read_bytes() == metrics
-    assert "wildlife-mappo-64-mpn-esp has other seeds or settings" in refused(*command, "--group", "d4")
-    fewer = ("compare-homomorphic", "--methods", "empn,mpn", "--steps", 64, "--seeds", 2, *board, *OPTIONS)
-    reused = (*fewer, "--out", tmp_path / "copied", "--reuse", out)
-    assert "0 runs to do" in esp(*reused, "--dry-run").stdout
-    assert not (tmp_path / "copied").exists()
-    assert esp(*reused).stderr.count("taking over") == 2
     report = esp("report", out, "--full")
     assert "stochastic return" in report.stdout, "what this kind of study reports"
     assert (out / "report" / "report.html").exists()
@@ -110,20 +99,6 @@ def test_flops_by_hand(seeds: tuple[int, ...]) -> None:
     assert ensemble == 4 * 2 * (14 * 10 + 10 * 5 + 14 * 14 + 5 * 5)
     convolutions = 8 * 8 * 49 * 16 + 4 * 4 * 16 * 25 * 32
     assert flops("wildlife", {"network.hidden": [64]}) == 2 * (convolutions + (2 * 32 + 2) * 64 + 64 * 5)
-
-
-def test_a_run_on_wildlife_goes_on_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("esp_cli.training.trainer.CHECKPOINT_SECONDS", 0.0)
-    base = ("train", "--task", "wildlife", *OPTIONS, "--steps", 160)
-    esp(*base, "--out", tmp_path / "whole")
-    cut = tmp_path / "cut"
-    esp(*base, "--out", cut)
-    newest = sorted((cut / "checkpoints").iterdir())
-    for file in newest[1:]:  # as if killed before these were written
-        file.unlink()
-    (cut / "policy.safetensors").unlink()
-    esp("train", "--resume", cut)
-    assert (cut / "policy.safetensors").read_bytes() == (tmp_path / "whole" / "policy.safetensors").read_bytes()
 
 
 @pytest.mark.parametrize("algo", ["maddpg", "qmix"])

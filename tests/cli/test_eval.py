@@ -127,18 +127,6 @@ def test_a_policy_of_a_gpu_plays_on_the_cpu_where_there_is_none(copied: Path, mo
     assert math.isfinite(result["greedy"]["mean"])
 
 
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        (["--episodes", "0"], "--episodes"),
-        (["--episodes", "many"], "valid integer"),
-        (["--speed", "3"], "No such option: --speed"),
-    ],
-)
-def test_a_bad_option_is_told_in_one_sentence(finished: Path, options: list[str], sentence: str) -> None:
-    assert sentence in refused("eval", finished, *options)
-
-
 def test_a_policy_is_judged_under_other_settings_of_its_task(finished: Path) -> None:
     trained = json.loads(esp("eval", finished, "--episodes", 2, "--json", "-").stdout)
     again = json.loads(

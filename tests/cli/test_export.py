@@ -68,7 +68,6 @@ def test_the_folder_that_comes_along_is_listed() -> None:
         (["-f", "tflite"], "there is no format 'tflite'; the formats are onnx, torch, c, numpy"),
         (["-f", "c", "--seed", "4"], "has no seed 4; it has 3, 7"),
         (["-f", "c", "--algo", "mappo"], "--algo and --prior choose among a task's policies"),
-        ([], "Missing option '--format'"),
     ],
 )
 def test_a_bad_option_is_told_in_one_sentence(

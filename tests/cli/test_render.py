@@ -194,13 +194,6 @@ def test_a_policy_is_drawn_under_other_settings_of_its_task(robots: Path, tmp_pa
     assert "mujoco" in refused("render", robots, "-o", tmp_path / "film.gif", "--physics", "marbles")
 
 
-def test_predators_and_prey_are_drawn_from_a_policy_file(tmp_path: Path) -> None:
-    run = train_tiny(tmp_path / "hunt", "--task", "predator-prey", steps=50)
-    esp("render", run / "policy.safetensors", "-o", tmp_path / "hunt.GIF", "--episodes", 1, "--size", 48)
-    with Image.open(tmp_path / "hunt.GIF") as film:
-        assert film.n_frames == FRAMES
-
-
 @pytest.mark.parametrize("name", ["film.mov", "film.jpg", "film", "gif"])
 def test_another_kind_of_file_is_refused(finished: Path, tmp_path: Path, name: str) -> None:
     sentence = refused("render", finished, "-o", tmp_path / name)
@@ -212,13 +205,9 @@ def test_another_kind_of_file_is_refused(finished: Path, tmp_path: Path, name: s
     ("options", "sentence"),
     [
         (["--seed", "4"], "has no seed 4; it has 3, 7"),
-        (["--size", "5"], "--size"),
-        (["--episodes", "0"], "--episodes"),
         (["--speed", "0"], "'0' is no speed; write a number from 0.01 to 100, as 0.5 or 4x"),
         (["--speed", "fast"], "'fast' is no speed"),
         (["--speed", "nan"], "'nan' is no speed"),
-        (["--fps", "0"], "--fps"),
-        (["--view", "side"], "--view"),
     ],
 )
 def test_a_bad_option_is_told_in_one_sentence(

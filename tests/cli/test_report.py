@@ -163,18 +163,6 @@ def test_runs_of_different_tasks_do_not_compare(finished: Path, tmp_path: Path) 
 
 
 @pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        (["--at", "soon"], "'soon' is not a number of steps"),
-        (["--threshold", "high"], "--threshold"),
-        (["--mode", "best"], "'best' is not one of 'greedy', 'stochastic'"),
-    ],
-)
-def test_a_bad_option_is_told_in_one_sentence(finished: Path, options: list[str], sentence: str) -> None:
-    assert sentence in refused("report", finished, *options)
-
-
-@pytest.mark.parametrize(
     ("content", "sentence"),
     [
         ("", "no row has the metric 'eval/return_greedy'"),

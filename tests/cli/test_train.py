@@ -49,15 +49,6 @@ def test_every_option_reaches_the_configuration(tmp_path: Path) -> None:
     assert len(read_metrics(run / "metrics.jsonl")[-1]["train/return"]) == 2
 
 
-def test_the_paper_preset_is_rot90_with_a_recurrent_network(tmp_path: Path) -> None:
-    config = config_of(train_tiny(tmp_path / "run", "--preset", "paper", steps=50))
-    prior = config["prior"]
-    assert (config["preset"], prior["transforms"], prior["consistency_coef"]) == ("paper", "rot90", 0.5)
-    assert (config["network"]["name"], config["network"]["layer_norm"]) == ("gru", True)
-    assert config["algorithm_settings"]["clip_value"] is True
-    assert config["algorithm_settings"]["num_envs"] == 2, "--set has the last word over the preset"
-
-
 def test_without_out_a_run_gets_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     esp("train", *TINY_OPTIONS, "--steps", 50, "--prior", "none")
@@ -163,14 +154,11 @@ def test_what_was_measured_before_training_is_told(tmp_path: Path, monkeypatch: 
     ("options", "sentence"),
     [
         (["--transforms", "c8"], "c8 cannot act on navigation: action 'left' turned by 45 degrees is no action"),
-        (["--transforms", "rot45,rot90"], "rot45,rot90 cannot act on navigation"),
         (["--transforms", "so2", "--set", "prior.copies=all", "--set", "task.actions=continuous"], "finite group"),
-        (["--transforms", "spin"], "spin"),
         (["--task", "chess"], "unknown task 'chess'; the tasks are navigation, predator-prey"),
         (["--task", "navigaton"], "unknown task 'navigaton'; did you mean 'navigation'?"),
         (["--algo", "MAPPO"], "unknown algorithm 'MAPPO'; did you mean 'mappo'?"),
         (["--task", "nowhere:Task"], "No module named 'nowhere'; it is looked for in /"),
-        (["--algo", "magic"], "unknown algorithm 'magic'; the algorithms are mappo"),
         (["--preset", "best"], "mappo has no preset 'best'; it has default, paper, fast"),
         (
             ["--prior", "some"],
@@ -178,25 +166,17 @@ def test_what_was_measured_before_training_is_told(tmp_path: Path, monkeypatch: 
         ),
         (["--network", "cnn"], "unknown network 'cnn'; the networks are mlp, gru"),
         (["--network", "gru", "--set", "mappo.num_steps=10"], "set mappo.num_steps to a multiple of 25"),
-        (["--set", "prior.consistency_coef=-1"], "prior.consistency_coef"),
-        (["--set", "prior.consistency_coef=nan"], "prior.consistency_coef"),
         (
             ["--set", "prior.consistency_coef=inf"],
             "bad value inf for 'prior.consistency_coef': it has to be a finite number",
         ),
-        (["--steps", "some"], "'some' is not a number of steps"),
-        (["--seeds", "2,2"], "name one seed twice"),
-        (["--seeds", "0"], "0 seeds cannot be trained at once"),
         (["--device", "tpu"], "'tpu' is not one of 'auto', 'cpu', 'cuda'"),
         (["--set", "learning_rate=1"], "cannot set 'learning_rate': a setting is SECTION.NAME"),
         (["--set", "mappo.speed=1"], "unknown setting 'mappo.speed'; mappo has num_envs"),
         (["--set", "mappo.gamma=2"], "bad value 2 for 'mappo.gamma': input should be less than or equal to 1"),
-        (["--set", "mappo.learning_rate=fast"], "bad value 'fast' for 'mappo.learning_rate'"),
         (["--set", "mappo.huber_delta=1e39"], "it has to be a finite number of at most 1e+30"),
         (["--set", "mappo.learning_rate=Infinity"], "it has to be a finite number"),
-        (["--set", "mappo.learning_rate"], "--set mappo.learning_rate is not a setting"),
         (["--set", "task.prey=still"], "unknown setting 'task.prey'"),
-        (["--set", "task.num_agents=0"], "bad value 0 for 'task.num_agents'"),
         (["--task", "predator-prey", "--set", "task.control=both", "--set", "task.prey=still"], "leave prey out"),
     ],
 )
@@ -299,38 +279,11 @@ def test_tensorboard_may_be_asked_for_on_resuming(copied: Path) -> None:
 
 @pytest.mark.parametrize(
     "kind",
-    [
-        "nothing there",
-        "a folder without a run",
-        "truncated checkpoints",
-        "config that is no JSON",
-        "config of another program",
-        "config of a newer version",
-        "seeds that are a text",
-        "a key nobody knows",
-        "a task nobody has",
-        "an algorithm nobody has",
-        "task settings of another",
-    ],
+    ["truncated checkpoints", "config of a newer version", "a task nobody has", "another number of seeds"],
 )
 def test_a_damaged_run_is_not_resumed(copied: Path, kind: str) -> None:
     damage, sentence = DAMAGE[kind]
     assert sentence in refused("train", "--resume", damage(copied))
-
-
-@pytest.mark.parametrize(
-    ("changes", "sentence"),
-    [
-        ({"task": None}, "bad value None for 'config.task'"),
-        ({"network": {"hidden": [9]}}, "was written under another configuration than that in"),
-        ({"seeds": [3]}, "was written under another configuration than that in"),
-        ({"algorithm_settings": {"gamma": "low"}}, "bad value 'low' for 'mappo.gamma'"),
-    ],
-)
-def test_a_configuration_that_was_changed_by_hand_is_not_resumed(
-    copied: Path, changes: dict[str, Any], sentence: str
-) -> None:
-    assert sentence in refused("train", "--resume", edit_config(copied, **changes))
 
 
 def test_a_policy_file_and_damaged_metrics_are_not_resumed(copied: Path) -> None:

@@ -173,10 +173,7 @@ NO_LIST = {
 MADE = {
     "nothing": (task(**give(None)), "'make_one' returns nothing; return a PettingZoo ParallelEnv"),
     "a class": (task(**give(Team)), "'make_one' returns the class Team instead of an object of it"),
-    "AEC": (
-        task(**give(AEC)),
-        "AEC environment, whose agents act in turn; wrap it in pettingzoo.utils.aec",
-    ),
+    "AEC": (task(**give(AEC)), "AEC environment, whose agents act in turn; wrap it in pettingzoo.utils.aec"),
     "make_vec": (task(**give(types.SimpleNamespace(single_action_space=1))), "a vector of environments; return one"),
     "one agent": (task(make_one=lambda self: Door()), "a Gymnasium environment; derive from .*SingleAgentTask"),
     "no agents": (task(**give(WITHOUT_AGENTS)), "a SimpleNamespace, which has no 'possible_agents'"),
@@ -218,6 +215,25 @@ MADE = {
     "off centre": (box([0, 0], [1, 1], "c2"), "by 'push', a vector, between .*, which 'c2' does not leave alone"),
     "boundless": (box([-3e38, -3e38], [3e38, 3e38], "c1"), "acts in Box.*, but the task says 2 bounded real numbers"),
     "any turn": (box([-1, -2], [1, 2], "o2"), "'o2' does not leave alone; declare a smaller symmetry"),
+    "fewer actions": (
+        task(action=Discrete(Kind.SCALAR, ((0.0,), (1.0,)), ("a", "b"))),
+        r"\(3\), but the task says 2 dis",
+    ),
+    "whole numbers": (
+        task(of={"action_space": lambda *_: spaces.Box(0, 10, (2,), np.int64)}, action=PUSH),
+        "acts in Box.*, but the task says 2 bounded real numbers",
+    ),
+    "wide state": (
+        task(of={"state": lambda _: np.zeros(3)}, state=Task.observation),
+        "state has 3 numbers, but the lay",
+    ),
+    "no learner": (task(learners="runner"), "no agent's name begins with 'runner'; the agents are a, b"),
+    "unsaid": (
+        task(action=None, symmetry=None),
+        "the class Zoo does not say its action, symmetry; set it in the class",
+    ),
+    "no mask": (task(masks=True), "a gets no 'action_mask', neither in its observation nor in its info"),
+    "wide mask": (task(masks=True, allowed=lambda *_: np.ones(4)), "a has a mask of 4 actions, but the task has 3"),
     "one-sided": (box([0], [1], "flip-x", TURN), "by 'turn', a pseudoscalar, between .*, which 'flip-x' does"),
 }
 
@@ -256,6 +272,9 @@ STEPPED = {
     "metric misspelt": (task(put(INFOS, {"a": {"hits": 1}}), metrics=("hit",)),
                         "no info of Zoo holds the metric 'hit' in a whole episode; they hold hits; correct"),
     "metric nowhere": (task(metrics=("hits",)), "the metric 'hits' in a whole episode; they hold nothing; correct"),
+    "reading raises": (task(reading=lambda _, name, seen: {0.0: seen}[seen[1]]), "raises in 'reading': KeyError: .*1"),
+    "measure raises": (task(metrics=("hit",), measure=lambda *_: {}), "raises in 'measure': KeyError: 'hit'"),
+    "no opponent": (task(learners="a"), "Zoo does not say how b acts; define 'opponent'"),
     "exits": (task(at(2, lambda self, out: sys.exit(0))), "copy 0 of Zoo raises in 'step': SystemExit: 0"),
     "raises": (task(lambda self, out: {}["x\ny"]), "copy 0 of Zoo raises in 'step': KeyError"),
 }  # fmt: skip
@@ -282,7 +301,6 @@ def test_what_a_step_leaves_out_is_refused_and_is_one_broken_promise(name):
 ENDING = {"terminates": True}
 ONE_BY_ONE = {"terminates": True, "agents_end": True}
 SPACES = {"a": spaces.Discrete(3), "b": spaces.Discrete(3)}
-ALL_FALSE = {"a": False, "b": False}
 RIGHT = {
     "the control": (task(), "...c...c."),
     "terminated for all": (task(at(2, lambda self, out: [*out[:2], {"__all__": True}, {}, {}]), **ENDING), ".T.T.T.T."),
@@ -405,10 +423,6 @@ def single(env=None, terminates=False, **members) -> type[SingleAgentTask]:
 
 SINGLE = {
     "a team": (single(Team()), "'make_single' returns a PettingZoo ParallelEnv; derive from .*ParallelTask"),
-    "make_vec": (
-        single(types.SimpleNamespace(single_action_space=1)),
-        "'make_single' returns a vector of environments",
-    ),
     "a class": (single(Door), "'make_single' returns the class Door instead of an object"),
     "old reset": (
         single(reset=lambda self, seed=None: np.zeros(2)),
@@ -418,17 +432,11 @@ SINGLE = {
         single(reset=lambda self, seed=None: (1.0, 2.0)),
         "'reset' returns 2 parts; return .obs",
     ),
-    "no seed": (single(reset=lambda self: (np.zeros(2), {})), "'reset' takes no seed"),
     "old step": (
         single(step=lambda self, a: (np.zeros(2), 1.0, False, {})),
         "'step' returns 4 parts",
     ),
-    "multi": (single(action_space=spaces.MultiBinary(3)), r"agent acts in MultiBinary\(3\)"),
     "a dictionary": (single(reset=lambda self, seed=None: ({"x": 1}, {})), "agent sees x, and the layout has"),
-    "no reward": (
-        single(step=lambda self, a: (np.zeros(2), None, False, False, {})),
-        "the reward of agent is a None",
-    ),
     "short": (single(step=lambda self, a: (np.zeros(2), 1.0, False, True, {})), "ends before its horizon; give both"),
 }
 

@@ -169,14 +169,3 @@ def test_a_learning_prey_sees_and_gets_what_simple_tag_gives(convention: str) ->
         np.testing.assert_allclose(obs[k, 0], seen[3], **NEAR)
         np.testing.assert_allclose(reward[k, 0], theirs.rewards["agent_0"], atol=2e-4)
     assert (reward < -0.1).mean() > 0.1, "too few prey out of bounds to say anything"
-
-
-def test_the_order_of_integration_tells_the_conventions_apart() -> None:
-    states = random_states(torch.Generator().manual_seed(1), 50, 3, 3)
-    after = []
-    for convention in ("esp", "pettingzoo"):
-        env = make("navigation", 50, [0], {"convention": convention})
-        env.set_state(states)
-        after.append(env.step(torch.ones(1, 50, 3, dtype=torch.int64)).next.state)
-    assert torch.equal(after[0][..., :6], after[1][..., :6]), "velocities do not depend on the order"
-    assert not torch.allclose(after[0][..., 6:12], after[1][..., 6:12], atol=1e-3)

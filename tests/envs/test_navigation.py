@@ -87,14 +87,6 @@ def test_starts_fill_their_squares() -> None:
             assert places.square().mean().item() == pytest.approx(side**2 / 3, rel=0.03)
 
 
-def test_long_forces_are_scaled_back_to_the_unit_disc() -> None:
-    env = make("navigation", 1, [0], {"actions": "continuous"})
-    env.set_state(torch.tensor([0.0] * 6 + [-1.0, 0, 0, 0, 1.0, 0] + [0.0] * 6).view(1, 1, -1))
-    force = torch.tensor([[3.0, 4.0], [0.3, -0.4], [0.0, 0.0]]).view(1, 1, 3, 2)
-    velocity = env.step(force).next.state[0, 0, :6]
-    torch.testing.assert_close(velocity, torch.tensor([0.3, 0.4, 0.15, -0.2, 0.0, 0.0]), atol=1e-6, rtol=0)
-
-
 ANCHORS = [  # settings, policy, mean return of one agent over 40,000 episodes (10,000 for cover)
     ({}, "random", -218.35),
     ({}, "greedy", -112.25),

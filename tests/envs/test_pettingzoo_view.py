@@ -223,13 +223,6 @@ def test_pictures_change_no_episode() -> None:
         np.testing.assert_array_equal(without, drawn)
 
 
-def test_unknown_tasks_and_settings_are_refused() -> None:
-    with pytest.raises(ValueError, match="unknown task"):
-        ParallelView("tag")
-    with pytest.raises(ValueError, match="colour"):
-        ParallelView("navigation", colour="red")
-
-
 def test_a_missing_package_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "esp_envs.pettingzoo_view")
     monkeypatch.setitem(sys.modules, "pettingzoo", None)

@@ -225,16 +225,12 @@ def test_the_prior_acts_in_each_role():
         build_learner(short(**{"prior.compass": 1.0}))
 
 
-def test_a_run_is_trained_evaluated_and_loaded(tmp_path: Path):
+def test_a_run_is_trained_and_evaluated_and_each_roles_policy_acts_and_is_exported(tmp_path: Path):
     begin(short(), None, tmp_path / "run").train()
     found = evaluate(open_policy(tmp_path / "run"), 6)
     assert {"return_hunter", "return_prey"} <= found.metrics.keys() & found.anchor_metrics["random"].keys()
     told = CALL.invoke(app, ["eval", str(tmp_path / "run"), "--episodes", "4", "--json", "-"])
     assert told.exit_code == 0, told.output
-
-
-def test_each_roles_policy_acts_and_is_exported_alone(tmp_path: Path):
-    begin(short(), None, tmp_path / "run").train()
     prey = load_policy(tmp_path / "run", role="prey")
     assert prey.spec.num_agents == 1
     assert prey.act([[0.0, 1.0, 2.0]]).shape == (1,)

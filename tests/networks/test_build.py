@@ -6,9 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from pydantic import Field
-from typer.testing import CliRunner
 
-from esp_cli.app import app
 from esp_cli.networks.build import NETWORKS, build_network, perceptron
 from esp_cli.networks.contract import Memoryless, NetworkConfig
 from esp_cli.networks.layers import SeedLinear
@@ -75,8 +73,3 @@ def test_every_network_lends_its_widths_to_a_perceptron(name):
 def test_a_perceptron_keeps_the_precision_of_a_recurrent_network():
     plain = perceptron(NETWORKS["gru"](precision="bfloat16", layer_norm=True), "tanh")
     assert (plain.precision, plain.layer_norm, plain.activation) == ("bfloat16", True, "tanh")
-
-
-def test_the_option_names_every_network():
-    shown = CliRunner().invoke(app, ["train", "--help"], env={"COLUMNS": "200"}).output
-    assert all(name in shown for name in NETWORKS)

@@ -163,18 +163,11 @@ def test_places_are_no_input_where_a_task_does_not_change_when_it_is_shifted(rea
 def test_values_of_agents_with_rewards_of_their_own_change_places_with_them(reads):
     spec, seen = scene(convention="pettingzoo")
     critic, order = network(spec, reads), [2, 0, 1]
-    agents = lambda x: x.unflatten(-1, (3, -1))[..., order, :].flatten(-2)  # noqa: E731
-    if reads == "state":
-        row, moved = seen.state, seen.state.clone()
-        for name in ("velocity", "position"):
-            where = spec.state.slices()[name]
-            moved[..., where] = agents(seen.state[..., where])
-    else:  # the others of each agent have another order then, which changes nothing
-        row, moved = seen.obs.flatten(2), agents(seen.obs.flatten(2))
+    row = seen.state if reads == "state" else seen.obs.flatten(2)
     values = critic(row)
     assert values.shape[-1] == 3
     assert (values - values[..., :1]).abs().amax() > 1e-3
-    torch.testing.assert_close(critic(moved), values[..., order], **CLOSE)
+    torch.testing.assert_close(critic(exchanged(spec, row, reads, order)), values[..., order], **CLOSE)
 
 
 @pytest.mark.parametrize("reads", ["own", "state", "observations"])

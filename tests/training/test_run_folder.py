@@ -98,30 +98,10 @@ def test_create_on_a_file_or_without_permission_is_one_sentence(tmp_path):
         RunFolder.create(tmp_path / "file" / "run", CONFIG)
 
 
-@pytest.mark.parametrize(
-    ("content", "text"),
-    [
-        (None, "is no run folder: it has no config.json"),
-        (b'{"format": "esp-run", "version": 1, "ta', "not valid JSON"),
-        (b'{"model_type": "llama"}', "is foreign: it is not the configuration of a run of esp"),
-        (b'{"format": "esp-run", "version": 2}', "written by a newer esp"),
-        (b'{"format": "esp-run", "version": 1, "run_id": 3}', "is damaged: its run_id is not a text"),
-    ],
-)
-def test_a_folder_that_is_no_run_is_one_sentence(tmp_path, content, text):
-    if content is not None:
-        (tmp_path / "config.json").write_bytes(content)
-    with pytest.raises(RunFolderError, match=re.escape(text)) as caught:
+def test_a_run_whose_identity_is_no_text_is_one_sentence(tmp_path):
+    (tmp_path / "config.json").write_text('{"format": "esp-run", "version": 1, "run_id": 3}')
+    with pytest.raises(RunFolderError, match=f"^{re.escape(str(tmp_path))}.* is damaged: its run_id is not a text"):
         RunFolder.open(tmp_path)
-    assert str(caught.value).startswith(str(tmp_path))
-
-
-def test_a_missing_folder_and_a_file_are_one_sentence(tmp_path):
-    (tmp_path / "file").touch()
-    with pytest.raises(RunFolderError, match="does not exist; give the folder"):
-        RunFolder.open(tmp_path / "no")
-    with pytest.raises(RunFolderError, match="is a file, not a run folder"):
-        RunFolder.open(tmp_path / "file")
 
 
 # Checkpoints
@@ -186,14 +166,6 @@ def test_a_damaged_newest_checkpoint_is_passed_over_with_a_note(folder, damage):
     assert re.search(rf"{newest.name} .*; going back to step 100$", "".join(notes))
     assert meta["step"] == 100
     assert tensors["weight"].tolist() == [100.0] * 4
-
-
-def test_only_damaged_checkpoints_are_an_error(folder):
-    write_checkpoints(folder, 100, 200)
-    for file in folder.checkpoints():
-        flip_a_bit(file)
-    with pytest.raises(RunFolderError, match=r"no good checkpoint \(.*step-000000000200.*does not match its checksum"):
-        folder.latest_checkpoint(pytest.fail)
 
 
 def test_checkpoints_that_another_process_has_just_removed_are_not_damaged(folder, monkeypatch):

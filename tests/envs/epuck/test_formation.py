@@ -247,11 +247,6 @@ def test_discrete_pairs_are_the_continuous_ones() -> None:
     assert len(formation_spec.WHEEL_PAIRS.points) == 121
 
 
-def test_actions_beyond_full_speed_are_clipped() -> None:
-    env, same = world([(0.0, 0.0)], [(0.5, 0.5)]), world([(0.0, 0.0)], [(0.5, 0.5)])
-    assert torch.equal(env.step(wheels((7.0, -3.0))).next.state, same.step(wheels((1.0, -1.0))).next.state)
-
-
 def test_a_delayed_action_acts_later() -> None:
     env, prompt = world([(0.0, 0.0)], [(0.5, 0.0)], action_delay=2), world([(0.0, 0.0)], [(0.5, 0.0)])
     orders = [wheels((1, 1)), wheels((0.2, 0.6)), wheels((-1, 0.3)), wheels((0, 0)), wheels((0, 0))]

@@ -125,12 +125,5 @@ def test_the_heavier_robot_pushes_the_other_away(name: str) -> None:
 
 
 @every_engine
-def test_the_slippery_robot_starts_late_and_is_pushed_away(name: str) -> None:
-    ways = []
-    for friction in (1.0, 0.05):
-        physics = engine(name, Arena(2.0, 1, 0, 0.1), np.zeros((1, 1, 3)), friction=np.full((1, 1), friction))
-        for _ in range(2):
-            physics.advance(full_ahead(1))
-        ways.append(physics.pose[0, 0, 0])
-    assert 0.1 * ways[0] < ways[1] < 0.75 * ways[0]
+def test_the_slippery_robot_is_pushed_away(name: str) -> None:
     assert contest(name, friction=np.array([[1.0, 0.05]])) > 0.01
