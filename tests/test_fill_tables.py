@@ -11,15 +11,13 @@ import pytest
 
 from esp_cli.reporting.collect import collect_study
 from esp_cli.reporting.study_figures import series_of
-from esp_cli.studies.paper import reported
 from esp_cli.studies.study import StudyFolder
-from tests.reporting.test_breaking import BASE, BROKEN, METHODS, NOISE, material, study
+from tests.reporting.test_breaking import BASE, BROKEN, NOISE, material, study
 from tests.studies.small_studies import small_study, write_run, write_study
 
 FILL = runpy.run_path(str(Path(__file__).parents[1] / "docs" / "fill_tables.py"))
-Verdict, filled, files_of, join, leaders = (FILL[n] for n in ("Verdict", "filled", "files_of", "join", "leaders"))
+Verdict, filled, files_of, join = (FILL[n] for n in ("Verdict", "filled", "files_of", "join"))
 methods_table, side, verdicts = (FILL[n] for n in ("methods_table", "side", "verdicts"))
-paper_table = FILL["TABLES"]["paper"]
 verdicts_table = FILL["verdicts_table"]
 __all__ = ["material"]  # a fixture
 BLOCK = "<!-- results: measured/a.json {} -->\nstale\n<!-- end of results -->"
@@ -49,20 +47,15 @@ def test_what_stands_between_the_marks_is_computed_and_the_rest_stays(page):
     assert files_of(page) == ["measured/a.json"]
 
 
-def test_filling_twice_changes_nothing_and_a_changed_number_does(page):
-    page.write_text(filled(page))
-    assert filled(page) == page.read_text()
-    file = page.parent / "measured" / "a.json"
-    found = json.loads(file.read_text())
-    found["cells"][0]["returns"]["greedy"][0] += 30
-    file.write_text(json.dumps(found))
-    assert filled(page) != page.read_text()
-
-
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
         ("a.json returns", "a.json wishes", "asks for the table 'wishes'"),
+        (
+            "json returns",
+            "json steps stochastic",
+            "'steps stochastic'; .*; returns, paper, comparison, pairs take a mode",
+        ),
         ("a.json", "b.json", "cannot read"),
         ("results:", "result:", "has no table to compute"),
     ],
@@ -73,25 +66,6 @@ def test_a_table_or_file_that_is_not_there_is_told(page, old, new, sentence):
         filled(page)
     with pytest.raises(ValueError, match="cannot read"):
         filled(page.with_name("no.md"))
-
-
-def test_a_table_of_final_returns_takes_those_of_drawn_actions(page):
-    file = page.parent / "measured" / "a.json"
-    found = json.loads(file.read_text())
-    for cell in found["cells"]:
-        cell["returns"]["stochastic"] = [value - 7 for value in cell["returns"]["greedy"]]
-    file.write_text(json.dumps(found))
-    page.write_text(page.read_text().replace("comparison -->", "comparison stochastic -->"))
-    greedy, _, drawn = filled(page).partition("between")
-    assert "-150.00 ± 5.77" in greedy
-    assert "of the greedy return" in greedy
-    assert "| MAPPO | -157.00 ± 5.77 |" in drawn
-    assert "Returns are those of drawn actions." in drawn
-    page.write_text(page.read_text().replace("comparison stochastic", "steps stochastic"))
-    with pytest.raises(
-        ValueError, match=r"asks for the table 'steps stochastic'; .*; returns, paper, comparison, pairs take a mode"
-    ):
-        filled(page)
 
 
 def longer(page, seeds=(0, 1), **change):
@@ -195,23 +169,6 @@ def test_a_method_may_be_behind_by_the_larger_of_both_errors(material):
     assert [{v.method: v.unbroken for v in verdicts(one)}["compass"] for one in both] == [False, True]
 
 
-def test_a_page_has_one_column_for_each_method_and_marks_the_best(material):
-    """Seeds of all methods differ by the same noise, so methods are level only where their means are equal."""
-    results = material.results
-    end, early = methods_table(results), methods_table(results, early=True)
-    assert end.headings == ("navigation, MAPPO, 200", *(f"{method}>" for method in METHODS))
-    assert [row[0] for row in end.rows] == ["unbroken", "wind 0.3", "wind 0.6"]
-    best = [{method for method, text in zip(METHODS, row[1:], strict=True) if "(*)" in text} for row in end.rows]
-    assert best == [{name for name, mean in BASE.items() if mean == -120.0}, {"compass"}, {"compass"}]
-    assert end.rows[1][1:3] == ("-150.00 ± 0.58", "-180.00 ± 0.58")
-    assert early.rows[1][1].startswith("-170.00")
-    twice = [cell.model_copy(update={"panel": cell.panel.replace("MAPPO", "QMIX")}) for cell in results.cells]
-    both = methods_table(results.model_copy(update={"cells": (*results.cells, *twice)}))
-    assert (both.headings[0], both.rows[3][0]) == ("run", "navigation, QMIX, 200, unbroken")
-    cells = {name: cell.model_copy(update={"early": None}) for name, cell in series_of(results)[0].cells[0.3].items()}
-    assert leaders(results, cells, early=True) == set()
-
-
 def test_equal_runs_are_level_and_one_seed_says_nothing(material):
     results = material.results
     cells = series_of(results)[0].cells[0.0]
@@ -250,42 +207,3 @@ def test_cells_of_one_name_in_other_panels_are_other_cells(tmp_path):
     assert (plain.name, prior.reference) == (results.cells[0].name, results.cells[1].reference)
     assert other_plain.name == f"elsewhere: {plain.name}"
     assert other_prior.reference == f"elsewhere: {prior.reference}"
-
-
-def test_the_papers_whole_table_marks_what_was_not_run(tmp_path):
-    study = small_study(steps=((None, 500_000),))
-    ends = {"MAPPO": [-150.0, -160.0, -140.0], "MAPPO-ESP": [-130.0, -120.0, -140.0]}
-    whole = paper_table(collect_study(write_study(tmp_path / "s", study, ends)).results)
-    assert len(whole.rows) == 12
-    assert whole.headings[2:] == ("MADDPG>", "MADDPG-ESP>", "QMIX>", "QMIX-ESP>", "MAPPO>", "MAPPO-ESP>")
-    place = next(k for k, row in enumerate(whole.rows) if row[0] == "navigation, 500k")
-    assert whole.rows[place][2:] == ("not run",) * 4 + ("-150.00 ± 5.77", "-130.00 ± 5.77")
-    number = reported(("table1", "navigation", "500000", "qmix", "esp"))
-    assert whole.rows[place + 1][5] == f"{number.mean:.2f} ± {number.sem:.2f}"
-
-
-def test_evaluations_and_curves_are_tables_too(tmp_path):
-    score = {"mean": -120.0, "sem": 1.5}
-    run = {"greedy": score, "stochastic": None, "heuristics": ["nearest", "cover"], "metrics": {"arrival_rate": 0.5}}
-    run |= {
-        "anchors": {"random": -220.0, "heuristic": -112.6, "cover": -109.1},
-        "metrics_per_seed": {"arrival_rate": [0.25, 0.75]},
-    }
-    run["metrics"] |= {"risky_rate": 0.1, "collisions": 0.0}
-    (tmp_path / "a.json").write_text(json.dumps({"plain, calm": run, "ESP, calm": run}))
-    curve = {
-        "label": "plain",
-        "seeds": [0, 1],
-        "seconds": 90.0,
-        "returns": {"100000": score},
-        "area_under_curve": score,
-    }
-    (tmp_path / "b.json").write_text(json.dumps({"runs": [curve]}))
-    page = tmp_path / "page.md"
-    page.write_text("".join(f"<!-- scores: {name}.json -->\n<!-- end of results -->\n" for name in "ab"))
-    text = filled(page)
-    assert (
-        "| ESP, calm | -120.00 ± 1.50 | - | 0.500 ± 0.250 | 0.100 | 0.000 |\n| cover, calm | -109.10 |  | - | - | - |"
-        in text
-    )
-    assert "| plain | 2 | -120.00 ± 1.50 | -120.00 ± 1.50 | 1.5 |" in text

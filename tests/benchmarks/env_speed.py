@@ -13,6 +13,8 @@ import argparse
 import json
 import statistics
 import time
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -25,59 +27,58 @@ DEFAULT_TASKS = ("navigation", "predator-prey", "wildlife")
 DEFAULT_WORLDS = (1024, 4096)
 
 
-def rates(env: Environment, seconds: float) -> tuple[float, float]:
-    """Run `env` with random actions for whole episodes until `seconds` have gone by.
+def figures(play: Callable[[], object], steps: int, seconds: float, runs: int) -> dict[str, float]:
+    """Return median, least and most env steps per second, and the median rate per second of this process's time.
 
-    Returns:
-        Env steps per second, and per second of this process's processor time.
+    Each run goes on where the last one stopped, until `seconds` have gone by; `play` takes so many env steps.
     """
-    worlds = env.num_seeds * env.num_envs
-    env.reset()
-    steps = 0
-    begin, worked = time.perf_counter(), time.process_time()
-    while (elapsed := time.perf_counter() - begin) < seconds:
-        for _ in range(env.spec.horizon):
-            env.step(env.random_action())
-        if env.device.type == "cuda":
-            torch.cuda.synchronize()
-        steps += env.spec.horizon
-    return steps * worlds / elapsed, steps * worlds / (time.process_time() - worked)
+
+    def rates(seconds: float) -> tuple[float, float]:
+        count, begin, worked = 0, time.perf_counter(), time.process_time()
+        while (elapsed := time.perf_counter() - begin) < seconds:
+            play()
+            count += steps
+        return count / elapsed, count / (time.process_time() - worked)
+
+    rates(min(seconds, 0.3))
+    on_clock, of_processor = zip(*(rates(seconds) for _ in range(runs)), strict=True)
+    found = {"steps_per_second": statistics.median(on_clock), "least": min(on_clock), "most": max(on_clock)}
+    return found | {"steps_per_cpu_second": statistics.median(of_processor)}
+
+
+def play_episode(env: Environment) -> None:
+    """Take as many random actions as an episode has."""
+    for _ in range(env.spec.horizon):
+        env.step(env.random_action())
+    if env.device.type == "cuda":
+        torch.cuda.synchronize()
 
 
 def measure(
     tasks: list[str], worlds: list[int], settings: dict[str, object], device: str, seconds: float, runs: int
 ) -> list[dict[str, object]]:
-    """Return one record per task and number of worlds: median, least and most rate, and median rate per CPU second."""
+    """Return one record per task and number of worlds."""
     records: list[dict[str, object]] = []
     for task in tasks:
         for count in worlds:
             known = task_class(task).Settings.model_fields
             own = {name: value for name, value in settings.items() if name in known}
             env = make(task, count, [0], own, device)
-            rates(env, min(seconds, 0.3))
-            on_clock, of_processor = zip(*(rates(env, seconds) for _ in range(runs)), strict=True)
-            records.append(
-                {
-                    "task": task,
-                    "worlds": count,
-                    "steps_per_second": statistics.median(on_clock),
-                    "least": min(on_clock),
-                    "most": max(on_clock),
-                    "steps_per_cpu_second": statistics.median(of_processor),
-                    "runs": runs,
-                }
-            )
+            env.reset()
+            found = figures(partial(play_episode, env), env.spec.horizon * count, seconds, runs)
+            records.append({"task": task, "worlds": count, **found, "runs": runs})
     return records
 
 
-def show(records: list[dict[str, object]], title: str) -> None:
-    """Print the records as a table."""
-    table = Table("task", "worlds", "env steps/s (median)", "range", "per CPU second", title=title)
+def show(records: list[dict[str, object]], title: str, names: Sequence[str], unit: str) -> None:
+    """Print the records as a table: what was measured by its names, rates in units of "k" or "M"."""
+    table = Table(*names, "env steps/s (median)", "range", "per CPU second", title=title)
     for record in records:
-        names = ("steps_per_second", "least", "most", "steps_per_cpu_second")
-        median, low, high, processor = (f"{float(str(record[name])) / 1e6:.2f}" for name in names)
-        row = (str(record["task"]), str(record["worlds"]), f"{median} M", f"{low} to {high} M", f"{processor} M")
-        table.add_row(*row)
+        rates = (record[name] for name in ("steps_per_second", "least", "most", "steps_per_cpu_second"))
+        shown = (float(str(rate)) / 1e3 if unit == "k" else float(str(rate)) / 1e6 for rate in rates)
+        median, low, high, processor = (f"{rate:.{1 if unit == 'k' else 2}f}" for rate in shown)
+        what = (str(record[name]) for name in names)
+        table.add_row(*what, f"{median} {unit}", f"{low} to {high} {unit}", f"{processor} {unit}")
     Console().print(table)
 
 
@@ -98,7 +99,7 @@ def main() -> None:
     tasks, worlds = args.task or list(DEFAULT_TASKS), args.worlds or list(DEFAULT_WORLDS)
     records = measure(tasks, worlds, settings, args.device, args.seconds, args.runs)
     where = f"{args.device}, {args.threads} thread{'s' if args.threads > 1 else ''}, {args.actions} actions"
-    show(records, f"environments alone ({where})")
+    show(records, f"environments alone ({where})", ("task", "worlds"), "M")
     if args.json:
         args.json.write_text(json.dumps({"device": args.device, "threads": args.threads, "records": records}, indent=2))
 

@@ -15,15 +15,12 @@ import argparse
 import itertools
 import json
 import os
-import statistics
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import torch
-from rich.console import Console
-from rich.table import Table
+from env_speed import figures, show
 
 from esp_envs import make
 from esp_envs.epuck.engines import ENGINES, make_physics
@@ -67,57 +64,18 @@ def of_formation(engine: str, worlds: int, threads: int) -> Callable[[], object]
     return lambda: env.step(env.random_action())
 
 
-def rates(step: Callable[[], object], worlds: int, seconds: float) -> tuple[float, float]:
-    """Go on from where the last run stopped until `seconds` have gone by.
-
-    Returns:
-        Env steps per second, and per second of this process's processor time.
-    """
-    steps = 0
-    begin, worked = time.perf_counter(), time.process_time()
-    while (elapsed := time.perf_counter() - begin) < seconds:
-        step()
-        steps += 1
-    return steps * worlds / elapsed, steps * worlds / (time.process_time() - worked)
-
-
 SUBJECTS = {"physics": of_physics, "formation": of_formation}
 
 
 def measure(
     engines: list[str], subjects: list[str], worlds: int, threads: list[int], seconds: float, runs: int
 ) -> list[dict[str, object]]:
-    """Return one record per subject, engine and number of threads, with the median, least and most rate."""
+    """Return one record per subject, engine and number of threads."""
     records: list[dict[str, object]] = []
-    for subject in subjects:
-        for engine in engines:
-            for count in threads:
-                step = SUBJECTS[subject](engine, worlds, count)
-                rates(step, worlds, min(seconds, 0.3))
-                on_clock, of_processor = zip(*(rates(step, worlds, seconds) for _ in range(runs)), strict=True)
-                records.append(
-                    {
-                        "subject": subject,
-                        "engine": engine,
-                        "threads": count,
-                        "steps_per_second": statistics.median(on_clock),
-                        "least": min(on_clock),
-                        "most": max(on_clock),
-                        "steps_per_cpu_second": statistics.median(of_processor),
-                    }
-                )
+    for subject, engine, count in itertools.product(subjects, engines, threads):
+        found = figures(SUBJECTS[subject](engine, worlds, count), worlds, seconds, runs)
+        records.append({"subject": subject, "engine": engine, "threads": count, **found})
     return records
-
-
-def show(records: list[dict[str, object]], title: str) -> None:
-    """Print the records as a table."""
-    table = Table("subject", "engine", "threads", "env steps/s (median)", "range", "per CPU second", title=title)
-    for record in records:
-        names = ("steps_per_second", "least", "most", "steps_per_cpu_second")
-        median, low, high, processor = (f"{float(str(record[name])) / 1e3:.1f}" for name in names)
-        what = (str(record[name]) for name in ("subject", "engine", "threads"))
-        table.add_row(*what, f"{median} k", f"{low} to {high} k", f"{processor} k")
-    Console().print(table)
 
 
 def main() -> None:
@@ -134,7 +92,8 @@ def main() -> None:
     threads = args.threads or sorted({1, os.cpu_count() or 1})
     engines, subjects = args.engine or list(ENGINES), args.subject or list(SUBJECTS)
     records = measure(engines, subjects, args.worlds, threads, args.seconds, args.runs)
-    show(records, f"e-pucks, {args.worlds} worlds of {ARENA.num_robots} robots and {ARENA.num_pillars} pillars")
+    title = f"e-pucks, {args.worlds} worlds of {ARENA.num_robots} robots and {ARENA.num_pillars} pillars"
+    show(records, title, ("subject", "engine", "threads"), "k")
     if args.json:
         args.json.write_text(json.dumps({"worlds": args.worlds, "runs": args.runs, "records": records}, indent=2))
 

@@ -21,7 +21,7 @@ from esp_cli.training.config import resolve_config
 from esp_envs import make
 from esp_envs.spec import Field, Kind, Spaces, TaskSpec, discrete_moves, layout
 from tests.networks.gradients import assert_same_gradients
-from tests.symmetry.checks import network_equivariance_error
+from tests.symmetry.checks import policy_equivariance_error
 
 SEEDS, WORLDS = 2, 12
 EXACT = 1e-5
@@ -108,7 +108,7 @@ def errors(spec: TaskSpec, config: NetworkConfig, obs: Tensor, state: Tensor, gr
         here = value(state if reads == "state" else obs)
         worst = max(
             worst,
-            network_equivariance_error(policy, None, obs, state, transform)["policy"],
+            policy_equivariance_error(policy, obs, transform),
             float((value(moved) - here).abs().max() / here.abs().max().clamp_min(1.0)),
         )
     return worst

@@ -134,12 +134,6 @@ def test_more_episodes_than_fit_at_once_are_played_in_batches(tmp_path, monkeypa
     assert len({round(x, 4) for x in episodes.flatten().tolist()}) == 10, "each episode is another one"
 
 
-def test_a_recurrent_policy_of_another_task_is_evaluated(tmp_path):
-    result = evaluate(untrained(tmp_path, (3,), task="predator-prey", network__name="gru"), 2)
-    assert set(result.metrics) == {"contact", "touches", "prey_distance"}
-    assert result.greedy.sem is None
-
-
 def test_rough_anchors_are_near_those_of_many_episodes_and_absent_where_they_would_say_little() -> None:
     config = resolve_config("predator-prey", seeds=[0, 1])
     rough, many = (

@@ -128,10 +128,3 @@ def test_products_are_in_float32_whatever_the_training_took(tmp_path: Path) -> N
     assert again.trained.config.network.precision == "float32"
     obs = np.random.default_rng(0).standard_normal((300, 14))
     assert np.array_equal(again.act(obs), policy.act(obs))
-
-
-def test_a_near_miss_of_a_name_is_answered_by_the_policy_that_is_meant() -> None:
-    with pytest.raises(ValueError, match="formatio does not exist; did you mean 'formation'"):
-        esp_cli.load_policy("formatio")
-    with pytest.raises(ValueError, match="does not exist; give a run folder"):
-        esp_cli.load_policy("nothing-of-the-kind")

@@ -210,10 +210,3 @@ def test_many_episodes_have_the_normal_interval_and_it_is_near_the_bootstraps() 
     assert many.sem is not None
     assert many.ci95 == pytest.approx((returns.mean() - 1.959964 * many.sem, returns.mean() + 1.959964 * many.sem))
     assert fewer.ci95 == pytest.approx(many.ci95, abs=0.1)
-
-
-def test_the_best_heuristic_is_one_and_what_is_no_better_than_chance_gives_no_scale() -> None:
-    anchors = {"random": -200.0, "heuristic": -150.0, "cover": -100.0}
-    assert normalised([-200.0, -150.0, -100.0], anchors).tolist() == [0.0, 0.5, 1.0]
-    for none in ({}, {"random": 1.0}, {"heuristic": 1.0}, {"random": 1.0, "heuristic": 1.0}):
-        assert normalised(1.0, none) is None

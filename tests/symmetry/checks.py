@@ -13,35 +13,14 @@ from esp_cli.symmetry.transforms import Transform
 if TYPE_CHECKING:
     from esp_envs.base import Environment, Observation, Step
 
-Network = Callable[[Tensor], Tensor]
 
-
-def network_equivariance_error(
-    policy: Network | None, value: Network | None, obs: Tensor, state: Tensor, transform: Transform
-) -> dict[str, float]:
-    """Measure how far a policy is from pi(K_g a | L_g s) = pi(a | s) and a value from V(L_g s) = V(s).
-
-    Args:
-        policy: obs [S, ..., N, D] to logits [S, ..., N, A] (compared as probabilities) or to means; or None.
-        value: state [S, ..., Ds] to values [S, ..., 1] or [S, ..., N]; or None.
-        obs: some observations.
-        state: some states.
-        transform: the elements to try.
-
-    Returns:
-        The largest absolute errors under "policy" and "value", for those that were given.
-    """
-    errors = {}
+def policy_equivariance_error(policy: Callable[[Tensor], Tensor], obs: Tensor, transform: Transform) -> float:
+    """Measure how far logits (compared as probabilities) or means are from pi(K_g a | L_g s) = pi(a | s)."""
     with torch.no_grad():
-        if policy is not None:
-            here, there = policy(obs), policy(transform.obs(obs))
-            pulled = transform.pull_back(there)
-            if transform.action_index is not None:
-                pulled, here = pulled.softmax(-1), here.softmax(-1)
-            errors["policy"] = _gap(pulled, here)
-        if value is not None:
-            errors["value"] = _gap(transform.values(value(transform.state(state))), value(state))
-    return errors
+        here, pulled = policy(obs), transform.pull_back(policy(transform.obs(obs)))
+    if transform.action_index is not None:
+        pulled, here = pulled.softmax(-1), here.softmax(-1)
+    return _gap(pulled, here)
 
 
 def environment_errors(
@@ -58,17 +37,9 @@ def environment_errors(
     The worlds take the actions from `state`, then K_g of them from L_g state, with the same noise; what the second run
     gives is compared with the transform of what the first gave. A world counts until its episode ends.
 
-    Args:
-        env: worlds to use.
-        transform: the elements to try, for as many seeds as `env` has, or one for all.
-        state: [S, E, state width].
-        actions: joint actions, one tensor per step.
-        restore_noise: called before each run (with None, then with the transform) by tasks whose own noise has a
-            direction that must be turned along.
-
-    Returns:
-        The largest absolute errors: "observation" (of the start), "reward" (Eq. 5), "next_obs", "next_state" (Eq. 6)
-        and "end" (1 where one run ended and the other went on).
+    `restore_noise` is called before each run (with None, then with the transform) by tasks whose own noise has a
+    direction that must be turned along. Returned are the largest absolute errors; "observation" is that of the start,
+    "end" is 1 where one run ended and the other went on.
     """
     noise = [g.get_state() for g in env.generators]
 
