@@ -156,9 +156,7 @@ def reached(links: tuple[str, ...]) -> str:
 
 
 @pytest.mark.parametrize(("question", "links", "answer"), QUESTIONS, ids=[one[0] for one in QUESTIONS])
-def test_a_question_is_answered_within_two_links_and_200_words(
-    question: str, links: tuple[str, ...], answer: str
-) -> None:
+def test_a_question_is_answered_within_two_links_and_200_words(question, links, answer):
     assert len(links) <= 2
     assert answer in reached(links)
 

@@ -152,11 +152,7 @@ def other(**changes):
 
 
 @pytest.mark.parametrize("actions", ["discrete", "continuous"])
-@pytest.mark.parametrize(
-    "change",
-    [{"consistency_coef": 0.0}, {"value_coef": 2.0}, {"augments": False}],
-    ids=str,
-)
+@pytest.mark.parametrize("change", [{"consistency_coef": 0.0}, {"value_coef": 2.0}, {"augments": False}], ids=str)
 def test_each_term_moves_the_gradient(change, actions):
     """The negative control of the comparison above."""
     ours, theirs = gradients(learner(task__actions=actions), other(**change))

@@ -108,10 +108,9 @@ def test_every_iteration_logs_what_the_page_promises(algorithm):
     _, metrics = after(algorithm)
     names = (
         "return epsilon augmented_share td_loss value value_symmetry_error "
-        + {
-            "maddpg": "critic_grad_norm policy_loss actor_grad_norm entropy policy_symmetry_error",
-            "qmix": "grad_norm",
-        }[algorithm]
+        + {"maddpg": "critic_grad_norm policy_loss actor_grad_norm entropy policy_symmetry_error", "qmix": "grad_norm"}[
+            algorithm
+        ]
     )
     assert set(metrics[-1]) == {f"train/{name}" for name in names.split()}
     assert all(value.shape == (2,) and value.isfinite().all() for value in metrics[-1].values())

@@ -118,10 +118,7 @@ MPE = {
     ),
     "collect_treasure": zoo(
         "mpe2.collect_treasure_v1",
-        observation={
-            "collector": layout(*OWN, Field("holding", S, 2), *AROUND),
-            "deposit": layout(*OWN, *AROUND),
-        },
+        observation={"collector": layout(*OWN, Field("holding", S, 2), *AROUND), "deposit": layout(*OWN, *AROUND)},
         action={"collector": MOVES, "deposit": MOVES},
         simulated=layout(
             *(Field(f"{who}.{what}", V, n, family=who) for who, n in TEAMS.items() for what in ("place", "speed")),

@@ -43,9 +43,7 @@ OWN = (Field("position", Kind.VECTOR), Field("velocity", Kind.VECTOR))
 PIECE = (Field("offset", Kind.VECTOR), Field("eaten", Kind.SCALAR))
 SCENARIOS = {
     "navigation": Scenario(
-        VmasTask.NAVIGATION,
-        3,
-        layout(*OWN, Field("from goal", Kind.VECTOR), Field("lidar", Kind.RING, rays=12)),
+        VmasTask.NAVIGATION, 3, layout(*OWN, Field("from goal", Kind.VECTOR), Field("lidar", Kind.RING, rays=12))
     ),
     "dispersion": Scenario(VmasTask.DISPERSION, 4, layout(*OWN, Field("food", Kind.RECORD, 4, parts=PIECE))),
 }

@@ -90,10 +90,7 @@ def test_logs_alone_show_the_quarter_turns_of_all_and_cover_only_some_of_the_oth
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("task", "settings", "left"),
-    [
-        ("navigation", {"mud": 0.5}, "flip-x"),
-        ("predator-prey", {"wind": 0.2}, "flip-x"),
-    ],
+    [("navigation", {"mud": 0.5}, "flip-x"), ("predator-prey", {"wind": 0.2}, "flip-x")],
     ids=str,
 )
 def test_transitions_accept_nothing_that_is_broken(task, settings, left) -> None:
@@ -267,9 +264,7 @@ def _measured_anew():
 
 @pytest.mark.usefixtures("_measured_anew")
 @pytest.mark.parametrize(("method", "weight"), [("paired states", 0.0408), ("transitions", 0.0)])
-def test_what_is_broken_weighs_little_and_what_nobody_knows_nothing(
-    method: str, weight: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_broken_weighs_little_and_what_nobody_knows_nothing(method, weight, monkeypatch):
     """Off by 0.4: exp(-8 x 0.4). Transitions show less of a breaking than there is, and a field may hide more."""
     off = (FieldVerdict("reward", "broken", 0.4, 0.01), FieldVerdict("obs.velocity", "broken", 0.1, 0.01))
     unseen = (FieldVerdict("reward", "not covered", 0.0, 0.01), FieldVerdict("obs.velocity", "holds", 0.0, 0.01, 0.0))

@@ -50,7 +50,6 @@ def train_tiny(out: Path, *options: object, steps: object = 150) -> Path:
 
 
 def printed(*options: object) -> dict[str, Any]:
-    """Return the configuration that a command line resolves to."""
     return json.loads(esp("train", "--print-config", *options).stdout)
 
 
@@ -68,7 +67,6 @@ def stored_config(run: Path) -> dict[str, Any]:
 
 
 def edit_config(run: Path, **changes: Any) -> Path:
-    """Change a run's configuration by hand and return its folder."""
     file = run / "config.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | changes))
     return run

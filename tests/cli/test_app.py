@@ -21,6 +21,7 @@ from esp_cli.app import app
 from esp_cli.commands import COMMANDS
 from esp_cli.commands.options import SeedsOption, StepsOption
 from esp_envs.errors import UserError
+from tests.cli.test_console import shell
 
 ROOT = Path(__file__).parents[2]
 runner = CliRunner()
@@ -163,34 +164,12 @@ def test_every_command_has_help_and_an_example() -> None:
         assert f"esp {name}" in result.stdout.split("╰")[-1], f"esp {name} --help ends without an example"
 
 
-def _python(code: str) -> subprocess.CompletedProcess[str]:
-    root = Path(__file__).parents[2]
-    path = os.pathsep.join([str(root), str(root / "environments")])
-    return subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": path},
-        check=False,
-    )
-
-
 def test_scipy_s_statistics_are_imported_only_where_they_are_asked_for() -> None:
-    done = _python(
-        "import sys\n"
-        "from esp_cli.policies.statistics import mean_and_sem\n"
-        "for sample in ([], [1.0], [1.0, 2.0]):\n"
-        "    sample and mean_and_sem(sample)\n"
-        "    print('scipy.stats' in sys.modules)\n"
-    )
+    code = "import sys; from esp_cli.policies.statistics import mean_and_sem as m;"
+    code += "f = lambda x: (x and m(x), 'scipy.stats' in sys.modules)[1]; print(f([]), f([1.0]), f([1.0, 2.0]))"
+    done = shell(f'PYTHON "{code}"')
     assert done.stdout.split() == ["False", "False", "True"], done.stderr
 
 
 def test_the_version_is_the_packages() -> None:
     assert runner.invoke(app, ["--version"]).stdout == f"esp {__version__}\n"
-
-
-def test_main_leaves_with_the_exit_code_and_without_a_traceback() -> None:
-    done = _python("import sys; sys.argv = ['esp', 'nothing']; from esp_cli.app import main; main()")
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("error: there is no command 'nothing'")

@@ -6,8 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from esp_cli.training.config import RunConfig
-from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.settings import parse_config
 from tests.cli.running import printed, refused, stored_config, written
 
@@ -147,9 +145,7 @@ def test_wrong_toml_is_one_sentence(tmp_path: Path, content: str, sentence: str)
     assert sentence in refused("train", "--config", written(tmp_path / "c.toml", content))
 
 
-def test_a_whole_configuration_does_not_take_another_learner_task_preset_or_network(
-    finished: Path, tmp_path: Path
-) -> None:
+def test_a_whole_configuration_does_not_take_another_learner_task_preset_or_network(finished, tmp_path):
     for flag, value, own in (
         ("--algo", "qmix", "mappo"),
         ("--task", "formation", "navigation"),
@@ -183,10 +179,3 @@ def test_a_name_that_is_near_to_nothing_gets_the_list() -> None:
     sentence = refused("train", "--print-config", "--set", "prior.colour=1")
     assert "did you mean" not in sentence
     assert "prior has kind, transforms" in sentence
-
-
-def test_a_configuration_without_the_new_key_is_read_as_before(finished: Path) -> None:
-    stored = RunFolder.open(finished).config
-    without = {key: value for key, value in stored.items() if key != "init_from"}
-    assert parse_config(without, finished) == parse_config(stored, finished)
-    assert RunConfig.model_fields["init_from"].default is None

@@ -55,13 +55,6 @@ def test_json_takes_what_the_engine_hands_over(tmp_path: Path) -> None:
     assert [path.name for path in target.parent.iterdir()] == ["result.json"]
 
 
-def test_json_on_standard_output_is_nothing_but_json(capsys: pytest.CaptureFixture[str]) -> None:
-    console.write_json("-", {"text": "a" * 500})
-    captured = capsys.readouterr()
-    assert json.loads(captured.out) == {"text": "a" * 500}
-    assert captured.err == ""
-
-
 def test_what_has_no_place_in_json_is_refused_and_leaves_the_old_file(tmp_path: Path) -> None:
     target = tmp_path / "result.json"
     target.write_text("{}")

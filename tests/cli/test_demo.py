@@ -37,11 +37,6 @@ def test_both_learners_are_trained_drawn_and_compared_and_a_second_call_trains_n
     assert "holds another study" in refused(*DEMO, "--out", out, "--seeds", 2)
 
 
-def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "mine.txt").touch()
-    assert "is not empty and no study (it has 'mine.txt'); choose another --out" in refused("demo", "--out", tmp_path)
-
-
 def test_curves_are_drawn_as_wide_as_the_terminal_and_as_far_as_they_are() -> None:
     drawn = draw_curves({"a": [(0, 1.0), (50, 2.0)], "b": [(0, 1.0)]}, 100, 60)
     rows = drawn.plain.splitlines()

@@ -152,9 +152,7 @@ def test_settings_that_a_policy_cannot_take_are_refused(finished: Path, setting:
     assert sentence in refused("eval", finished, "--episodes", 2, "--set", setting)
 
 
-def test_fewer_episodes_are_played_where_they_are_long_or_of_many_agents_and_the_output_says_so(
-    monkeypatch: pytest.MonkeyPatch, finished: Path
-) -> None:
+def test_fewer_episodes_are_played_where_they_are_long_or_of_many_agents_and_the_output_says_so(monkeypatch, finished):
     monkeypatch.setattr("esp_cli.commands.eval._AGENT_STEPS", 5 * 25 * 3 + 1)  # of navigation: 25 steps, 3 agents
     told = esp("eval", finished)
     assert "5 episodes" in told.stdout

@@ -33,9 +33,7 @@ def test_the_seed_that_is_named_goes_out(finished: Path, tmp_path: Path) -> None
     assert json.loads((tmp_path / "policy.json").read_text())["policy"]["seed"] == 7
 
 
-def test_without_a_compiler_the_source_is_written_and_said_to_be_unchecked(
-    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_compiler_the_source_is_written_and_said_to_be_unchecked(finished, tmp_path, monkeypatch):
     monkeypatch.setattr(c_file, "compiler", lambda: None)
     result = esp("export", finished, "-f", "c", "-o", tmp_path, "--seed", 7)
     assert "there is no C compiler cc here" in result.stderr
@@ -70,9 +68,7 @@ def test_the_folder_that_comes_along_is_listed() -> None:
         (["-f", "c", "--algo", "mappo"], "--algo and --prior choose among a task's policies"),
     ],
 )
-def test_a_bad_option_is_told_in_one_sentence(
-    finished: Path, tmp_path: Path, options: list[str], sentence: str
-) -> None:
+def test_a_bad_option_is_told_in_one_sentence(finished, tmp_path, options, sentence):
     assert sentence in refused("export", finished, "-o", tmp_path / "out", *options)
     assert not (tmp_path / "out").exists()
 

@@ -47,17 +47,13 @@ def test_train_eval_render_and_report(tmp_path: Path, algorithm: str, more: list
     verdict = json.loads(result.read_text())
     assert len(verdict["greedy"]["per_seed"]) == 2
     assert verdict["greedy"]["per_seed"] != verdict["stochastic"]["per_seed"]
-    esp("eval", run / "policy.safetensors", "--episodes", 3, "--json", tmp_path / "file.json")
-    assert json.loads((tmp_path / "file.json").read_text())["greedy"] == verdict["greedy"]
     esp("render", run, "-o", film, "--episodes", 1, "--seed", 7)
     assert film.stat().st_size > 1000
     esp("report", run, "--json", tmp_path / "report.json")
 
 
 @pytest.mark.parametrize("algorithm", ["maddpg", "qmix"])
-def test_a_run_stopped_and_resumed_equals_one_run_through(
-    tmp_path: Path, algorithm: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_stopped_and_resumed_equals_one_run_through(tmp_path, algorithm, monkeypatch):
     straight, halted = tmp_path / "a", tmp_path / "b"
     esp("train", *options(algorithm), "--out", straight)
     with monkeypatch.context() as patch:

@@ -47,9 +47,7 @@ def test_a_count_survives_being_written_and_read(number: int, scale: int) -> Non
     ("text", "seeds"),
     [("1", (0,)), ("3", (0, 1, 2)), (2, (0, 1)), ("3,7", (3, 7)), ("7,", (7,)), ("5, 0", (5, 0)), ((4,), (4,))],
 )
-def test_a_number_of_seeds_is_read_and_the_old_list_too(
-    text: str | int | tuple[int, ...], seeds: tuple[int, ...], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_number_of_seeds_is_read_and_the_old_list_too(text, seeds, capsys):
     assert parse_seeds(text) == seeds
     note = f"--seeds {text} is now --seed-list {','.join(map(str, seeds))}\n"
     assert capsys.readouterr().err == (note if isinstance(text, str) and "," in text else "")

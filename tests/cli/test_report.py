@@ -73,17 +73,13 @@ def test_two_runs_are_held_against_each_other(finished: Path, plain: Path, tmp_p
     assert f"curves -> {picture}" in told.stderr
 
 
-def test_json_on_standard_output_is_alone_there_and_the_last_common_step_is_the_default(
-    finished: Path, plain: Path, tmp_path: Path
-) -> None:
+def test_json_on_standard_output_is_alone_there_and_the_last_common_step_is_the_default(finished, plain, tmp_path):
     short = train_tiny(tmp_path / "short", "--seed-list", "3,7", steps=100)
     result = json.loads(esp("report", finished, short, plain, "--json", "-").stdout)
     assert [(cell["at"], cell["step"]) for cell in result["cells"]] == [(100, 150), (100, 100), (100, 150)]
 
 
-def test_page_markdown_results_and_terminal_compare_at_the_same_step(
-    finished: Path, plain: Path, tmp_path: Path
-) -> None:
+def test_page_markdown_results_and_terminal_compare_at_the_same_step(finished, plain, tmp_path):
     short = train_tiny(tmp_path / "a b", "--seed-list", "3,7", "--prior", "none", steps=100)
     out, small = tmp_path / "the page", tmp_path / "results.json"
     told = esp("report", f"short={short}", f"ESP={finished}", "--out", out, "--results", small)
@@ -107,9 +103,7 @@ def test_page_markdown_results_and_terminal_compare_at_the_same_step(
     assert "--at 50 --mode stochastic --out " in (out / "report.md").read_text()
 
 
-def test_figures_for_papers_are_a_column_wide_with_embedded_letters(
-    finished: Path, plain: Path, tmp_path: Path
-) -> None:
+def test_figures_for_papers_are_a_column_wide_with_embedded_letters(finished, plain, tmp_path):
     told = esp("report", plain, finished, "--style", "paper", "--out", tmp_path / "out", "--plot", tmp_path / "c.pdf")
     assert f"curves -> {tmp_path / 'c.pdf'}" in told.stderr
     for pdf in ((tmp_path / "c.pdf").read_bytes(), (tmp_path / "out" / "curves.pdf").read_bytes()):

@@ -50,13 +50,6 @@ def test_bounds_units_presets_and_tasks_are_told() -> None:
     assert found["mappo.critic_input"].bounds == "state, observations, own"
 
 
-def test_a_value_is_told_once_and_as_set_takes_it() -> None:
-    table = " ".join(esp("settings", "prior").stdout.split())
-    assert "paper: 0.5" in table
-    assert "mappo paper 0.5" not in table
-    assert "│ weights │ {} │" in table
-
-
 def test_the_table_and_the_json_name_every_setting_of_a_section() -> None:
     told = esp("settings", "mappo", "--json", "-").stdout
     names = [one["name"] for section in json.loads(told) for one in section["settings"]]

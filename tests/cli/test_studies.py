@@ -199,9 +199,7 @@ def test_a_study_is_reported_by_itself_and_held_by_one_process(tmp_path: Path, f
     assert not (tmp_path / "t" / "runs").exists()
 
 
-def test_progress_in_a_pipe_says_what_changed_and_a_line_a_minute(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_progress_in_a_pipe_says_what_changed_and_a_line_a_minute(tmp_path, capsys):
     folder = StudyFolder.create(tmp_path / "s", small_study())
     plain, esp_run = runs = Scheduler(folder, folder.study.cells, 1, LocalEngine(stand_in())).runs
     now = [0.0]
@@ -228,9 +226,7 @@ def test_progress_in_a_pipe_says_what_changed_and_a_line_a_minute(
     assert "1 failed" in whole_status(Snapshot(runs, 0.0))
 
 
-def test_progress_on_a_terminal_has_a_bar_for_each_running_process(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_progress_on_a_terminal_has_a_bar_for_each_running_process(tmp_path, monkeypatch):
     terminal = console.streams.SafeConsole(force_terminal=True, width=120, file=(tmp_path / "screen").open("w"))
     monkeypatch.setattr(console.progress, "err", terminal)
     folder = StudyFolder.create(tmp_path / "s", small_study())

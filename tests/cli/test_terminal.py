@@ -24,7 +24,6 @@ from esp_cli import console
 from esp_cli.app import app, build_command
 from esp_cli.commands import COMMANDS
 from esp_cli.console import lay_out, progress, streams
-from esp_cli.policies.bundled import read_bundled
 from tests.cli.running import TINY_OPTIONS, esp
 
 ROOT = Path(__file__).parents[2]
@@ -58,9 +57,7 @@ def test_a_table_that_fits_has_lines_and_one_that_cannot_is_a_block_per_row() ->
 
 
 @pytest.mark.parametrize(("width", "bar"), [(140, 10), (90, 7), (60, 0), (30, 0)])
-def test_a_narrow_terminal_shortens_the_bar_before_step_rate_and_time(
-    width: int, bar: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_narrow_terminal_shortens_the_bar_before_step_rate_and_time(width, bar, monkeypatch, capsys):
     screen = Console(width=width, force_terminal=True, color_system=None, highlight=False)
     monkeypatch.setattr(progress, "err", screen)
     live = progress.live_progress()
@@ -122,12 +119,6 @@ def test_tables_of_runs_fit_80_columns(monkeypatch: pytest.MonkeyPatch, finished
         tables = [line for line in lines if not line.startswith("2 runs to do")]
         assert too_wide(tables) == [], arguments
         assert not any("…" in line for line in lines)
-
-
-def test_the_names_of_policies_are_whole_at_80_columns(monkeypatch: pytest.MonkeyPatch) -> None:
-    lines = at_80(monkeypatch, "policies")
-    for entry in read_bundled():
-        assert any(re.search(rf"(?<![\w-]){entry.name}(?![\w-])", line) for line in lines), entry.name
 
 
 def test_a_line_that_is_too_wide_is_found() -> None:
@@ -246,11 +237,3 @@ def completed(line: str, **environment: str) -> list[str]:
 )
 def test_the_shell_is_offered_what_can_follow(line: str, offered: list[str]) -> None:
     assert completed(line) == offered
-
-
-@pytest.mark.parametrize(
-    ("shell", "part"), [("bash", "complete -o default -F"), ("zsh", "#compdef esp"), ("fish", "complete --command esp")]
-)
-def test_each_shell_has_a_script_that_asks_the_application(shell: str, part: str) -> None:
-    told = _runner.invoke(app, [], prog_name="esp", env={"_ESP_COMPLETE": f"source_{shell}"})
-    assert part in told.stdout

@@ -180,9 +180,7 @@ def test_what_was_measured_before_training_is_told(tmp_path: Path, monkeypatch: 
         (["--task", "predator-prey", "--set", "task.control=both", "--set", "task.prey=still"], "leave prey out"),
     ],
 )
-def test_what_is_wrong_is_told_in_one_sentence_and_leaves_no_folder(
-    tmp_path: Path, options: list[str], sentence: str
-) -> None:
+def test_what_is_wrong_is_told_in_one_sentence_and_leaves_no_folder(tmp_path, options, sentence):
     assert sentence in refused("train", *STEPS, "--out", tmp_path / "run", *options)
     assert not (tmp_path / "run").exists()
 
@@ -278,8 +276,7 @@ def test_tensorboard_may_be_asked_for_on_resuming(copied: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "kind",
-    ["truncated checkpoints", "config of a newer version", "a task nobody has", "another number of seeds"],
+    "kind", ["truncated checkpoints", "config of a newer version", "a task nobody has", "another number of seeds"]
 )
 def test_a_damaged_run_is_not_resumed(copied: Path, kind: str) -> None:
     damage, sentence = DAMAGE[kind]
@@ -293,9 +290,7 @@ def test_a_policy_file_and_damaged_metrics_are_not_resumed(copied: Path) -> None
     assert "line 1 is not a row of metrics" in refused("train", "--resume", copied)
 
 
-def test_a_run_of_which_a_seed_stopped_is_summed_up_over_the_others(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_of_which_a_seed_stopped_is_summed_up_over_the_others(tmp_path, monkeypatch):
     iterate = Mappo.iterate
 
     def broken(self: Mappo, progress: float) -> Iteration:
@@ -357,9 +352,7 @@ def test_a_page_to_watch_shows_curve_and_policy_and_changes_nothing(tmp_path: Pa
     assert same[0] == same[1]
 
 
-def test_a_page_that_cannot_be_drawn_is_told_once_and_stops_no_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_page_that_cannot_be_drawn_is_told_once_and_stops_no_run(tmp_path, monkeypatch):
     def fails(*_: object, **__: object) -> None:
         raise MemoryError("no room for pixels")
 

@@ -49,16 +49,12 @@ def test_a_dry_run_states_the_cost_of_equal_budgets_and_makes_nothing(command: l
         (["--steps", "formation=500k"], "--steps formation=500000 concerns no run of this tuning"),
     ],
 )
-def test_what_is_wrong_is_told_before_there_is_a_folder(
-    command: list[object], tmp_path: Path, options: list[str], sentence: str
-) -> None:
+def test_what_is_wrong_is_told_before_there_is_a_folder(command, tmp_path, options, sentence):
     assert sentence in refused(*command, *(() if "--steps" in options else ("--steps", "300")), *options)
     assert not (tmp_path / "t").exists()
 
 
-def test_without_optuna_tuning_is_refused_in_one_sentence(
-    command: list[object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_optuna_tuning_is_refused_in_one_sentence(command, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "optuna", None)
     monkeypatch.delitem(sys.modules, "esp_cli.studies.search", raising=False)
     assert refused(*command, "--steps", "300") == "Optuna is not installed: pip install 'optuna>=4.2'"
@@ -66,9 +62,7 @@ def test_without_optuna_tuning_is_refused_in_one_sentence(
 
 
 @pytest.mark.usefixtures("forked_jobs")
-def test_a_search_goes_from_a_command_to_a_preset_and_a_study_on_fresh_seeds(
-    command: list[object], tmp_path: Path
-) -> None:
+def test_a_search_goes_from_a_command_to_a_preset_and_a_study_on_fresh_seeds(command, tmp_path):
     words = [*command, "--budget", 2, "--steps", 200, "--trial-seeds", 1, "--seeds", 2, "--episodes", 4, "--jobs", 2]
     told = esp(*words)
     out = tmp_path / "t"
@@ -95,9 +89,7 @@ def test_a_search_goes_from_a_command_to_a_preset_and_a_study_on_fresh_seeds(
 
 
 @pytest.mark.usefixtures("forked_jobs")
-def test_a_setting_of_the_task_is_refused_by_its_name_and_auto_is_a_prior_as_any(
-    command: list[object], tmp_path: Path
-) -> None:
+def test_a_setting_of_the_task_is_refused_by_its_name_and_auto_is_a_prior_as_any(command, tmp_path):
     (tmp_path / "space.json").write_text(json.dumps({"mappo.gamma": [0.9, 0.99], "prior.kind": ["none"]}))
     assert "takes the kinds of prior by --prior" in refused(*command, "--steps", 100)
     (tmp_path / "space.json").write_text(json.dumps({"navigation.wind": [0.0, 0.3], "prior.doubt": [4.0, 8.0]}))

@@ -114,14 +114,6 @@ def test_at_the_horizon_only_who_arrives_with_that_very_step_has_ended():
     assert bool(last_step(together, walking=1).terminated.all()), "where nothing says who has ended, one ends all"
 
 
-def test_masks_come_from_observations():
-    env = worlds(Walkers, 20, (0,), workers=0)
-    seen = env.reset()
-    places = seen.obs[..., 0]
-    assert torch.equal(seen.action_mask[..., 2], places > 0)
-    assert not bool(seen.action_mask[..., 2].all())
-
-
 def test_without_the_attributes_masks_are_left_alone():
     env = worlds(type("Plain", (Walkers,), {"agents_end": False, "masks": False}), 40, (0,), workers=0)
     seen = env.reset()

@@ -179,10 +179,7 @@ MADE = {
     "no agents": (task(**give(WITHOUT_AGENTS)), "a SimpleNamespace, which has no 'possible_agents'"),
     "a number": (task(**give(7)), "'make_one' returns a int, which has no 'reset and step'"),
     "nobody": (task(of={"possible_agents": ()}), "the agents are none"),
-    "old reset": (
-        task(of={"reset": lambda self, seed=None: {}}),
-        "'reset' returns a dict; return .observations",
-    ),
+    "old reset": (task(of={"reset": lambda self, seed=None: {}}), "'reset' returns a dict; return .observations"),
     "no seed": (task(of={"reset": lambda self: ({}, {})}), "'reset' takes no seed; define reset.self, seed=None"),
     "rows": (task(of={"reset": lambda self, seed: ([1, 2], {})}), "'reset' returns observations as a list"),
     "reset raises": (task(of={"reset": lambda self, seed: 1 / 0}), "copy 0 of Zoo raises in 'reset': ZeroDivision"),
@@ -424,18 +421,9 @@ def single(env=None, terminates=False, **members) -> type[SingleAgentTask]:
 SINGLE = {
     "a team": (single(Team()), "'make_single' returns a PettingZoo ParallelEnv; derive from .*ParallelTask"),
     "a class": (single(Door), "'make_single' returns the class Door instead of an object"),
-    "old reset": (
-        single(reset=lambda self, seed=None: np.zeros(2)),
-        "'reset' returns a ndarray; return .obs",
-    ),
-    "reset twice": (
-        single(reset=lambda self, seed=None: (1.0, 2.0)),
-        "'reset' returns 2 parts; return .obs",
-    ),
-    "old step": (
-        single(step=lambda self, a: (np.zeros(2), 1.0, False, {})),
-        "'step' returns 4 parts",
-    ),
+    "old reset": (single(reset=lambda self, seed=None: np.zeros(2)), "'reset' returns a ndarray; return .obs"),
+    "reset twice": (single(reset=lambda self, seed=None: (1.0, 2.0)), "'reset' returns 2 parts; return .obs"),
+    "old step": (single(step=lambda self, a: (np.zeros(2), 1.0, False, {})), "'step' returns 4 parts"),
     "a dictionary": (single(reset=lambda self, seed=None: ({"x": 1}, {})), "agent sees x, and the layout has"),
     "short": (single(step=lambda self, a: (np.zeros(2), 1.0, False, True, {})), "ends before its horizon; give both"),
 }

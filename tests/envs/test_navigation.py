@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from esp_envs import Discrete, make
+from esp_envs import make
 from esp_envs.mpe import covering
 from esp_envs.mpe.navigation import Navigation
 from tests.envs.playing import episode_return
@@ -67,13 +67,6 @@ def test_default_landmarks_are_the_papers(agents: int, landmarks: int) -> None:
     spec = make("navigation", 1, [0], {"num_agents": agents}).spec
     assert spec.observation.width == 2 * (2 + landmarks + agents - 1)
     assert spec.settings["num_landmarks"] == landmarks
-
-
-def test_spec_names_the_symmetry_that_the_actions_carry() -> None:
-    discrete, continuous = make("navigation", 1, [0]).spec, make("navigation", 1, [0], {"actions": "continuous"}).spec
-    assert (discrete.symmetry, continuous.symmetry) == ("d4*agents", "o2*agents")
-    assert isinstance(discrete.action, Discrete)
-    assert discrete.action.names == ("no-op", "left", "right", "down", "up")
 
 
 def test_starts_fill_their_squares() -> None:

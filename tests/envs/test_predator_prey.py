@@ -152,13 +152,7 @@ def test_anchors(settings: dict[str, object], policy: str, expected: float) -> N
 
 
 @pytest.mark.parametrize(
-    "settings",
-    [
-        {"prey": "policy"},
-        {"control": "prey", "prey": "fleeing"},
-        {"num_predators": 0},
-        {"prey": "wild"},
-    ],
+    "settings", [{"prey": "policy"}, {"control": "prey", "prey": "fleeing"}, {"num_predators": 0}, {"prey": "wild"}]
 )
 def test_settings_that_contradict_each_other_are_refused(settings: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="PredatorPreySettings"):

@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 import esp_envs
-from esp_envs import BatchedTask, Environment, installed, make, register, registry, task_class, task_names
-from tests.own_tasks import save_page_files
+from esp_envs import Environment, installed, make, register, registry, task_class, task_names
 
 
 @pytest.fixture
@@ -23,15 +22,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     yield tmp_path
     for name in set(sys.modules) - before:
         del sys.modules[name]
-
-
-def test_a_task_in_the_working_directory_is_registered_by_module_and_class(folder: Path) -> None:
-    save_page_files(folder)
-    assert register("rendezvous:Rendezvous") == "rendezvous:Rendezvous"
-    assert "rendezvous:Rendezvous" in task_names()
-    env = make("rendezvous:Rendezvous", 2, [0], {"num_agents": 4})
-    assert isinstance(env, BatchedTask)
-    assert env.reset().obs.shape == (1, 2, 4, 6)
 
 
 def test_a_name_alone_never_imports_a_module(folder: Path) -> None:

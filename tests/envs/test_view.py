@@ -90,9 +90,7 @@ def test_the_whole_arena_is_in_the_picture_and_fills_it(window: tuple[float, flo
 
 
 @pytest.mark.parametrize("place", [(0.0, 0.0), (0.4, 0.3), (-0.8, 0.9), (0.9, -0.85)])
-def test_a_robot_is_drawn_where_it_is_and_moves_when_it_moves(
-    painter: SpacePainter, place: tuple[float, float]
-) -> None:
+def test_a_robot_is_drawn_where_it_is_and_moves_when_it_moves(painter, place):
     picture = painter.draw(scene(replace(ROBOT, position=place)))
     assert picture.shape == (360, 480, 3)
     assert picture.dtype == np.uint8
@@ -258,9 +256,7 @@ def test_a_variable_is_forgotten_only_where_its_library_is_missing(monkeypatch: 
 
 @pytest.mark.parametrize(("value", "refused"), [("nonsense", True), ("gl", True), ("egl,osmesa", True), ("'egl'", True),
                                                 ("disable", False), (" GLFW ", False), ("0", False)])  # fmt: skip
-def test_a_variable_that_names_nothing_is_one_sentence(
-    value: str, refused: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_variable_that_names_nothing_is_one_sentence(value, refused, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", value)
     with pytest.raises(ValueError, match=r"MUJOCO_GL is .*; set it to .* or unset it") if refused else nullcontext():
         gl.forget_missing_backend()

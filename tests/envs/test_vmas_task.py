@@ -247,10 +247,7 @@ def drifting(**members):
 @pytest.mark.parametrize(
     ("members", "sentence"),
     [
-        (
-            {"observation": lambda _, agent: {"x": agent.state.pos}},
-            r"observation 0 is a dict; give each",
-        ),
+        ({"observation": lambda _, agent: {"x": agent.state.pos}}, r"observation 0 is a dict; give each"),
         (
             {"observation": lambda _, agent: torch.zeros(3, 4 if agent.name == "agent_0" else 5)},
             r"observation 1 is \[3, 5\]; give each agent a tensor \[3, 4\]",

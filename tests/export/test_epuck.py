@@ -23,9 +23,7 @@ SETTINGS = {
 
 
 @pytest.mark.parametrize("case", SETTINGS)
-def test_a_pilot_sees_from_poses_what_the_task_shows(
-    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_pilot_sees_from_poses_what_the_task_shows(case, tmp_path, monkeypatch):
     trained = drawn_policy("wheels", **SETTINGS[case])
     assert epuck.STATES == 10_000, "in an export; that the formulas are the same shows in fewer"
     states = 1_000 if case == "offset" else 300

@@ -185,11 +185,5 @@ def test_an_onnx_export_without_its_libraries_names_them(monkeypatch: pytest.Mon
         onnx_file.library("onnx")
 
 
-def test_a_file_in_the_way_of_the_folder_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    with pytest.raises(ValueError, match="is a file; name a folder"):
-        export(drawn_policy("wheels"), ["numpy"], tmp_path / "file")
-
-
 def test_the_command_lists_every_format() -> None:
     assert tuple(FORMATS) == command.FORMATS

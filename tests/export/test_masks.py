@@ -45,9 +45,7 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @needs_cc
 @pytest.mark.parametrize("kind", MASKED)
-def test_exports_choose_among_allowed_actions_as_the_policy_does(
-    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_exports_choose_among_allowed_actions_as_the_policy_does(kind, tmp_path, monkeypatch):
     results = export(drawn_policy(kind), ("numpy", "c", "onnx", "torch"), tmp_path).formats
     for result in results:
         assert result.agreement is not None

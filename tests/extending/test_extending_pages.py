@@ -144,12 +144,6 @@ def test_an_installed_distribution_brings_both_under_names_of_its_own(saved, tmp
     assert load_policy("run").spec.name == "navigation"
 
 
-def test_an_unknown_algorithm_and_network_are_refused(tmp_path):
-    """Negative control: without an entry point and without module:Class there is neither."""
-    assert "unknown algorithm 'theirs'" in refused("train", "--algo", "theirs", "--out", tmp_path / "no")
-    assert "unknown network 'deep'" in refused("train", "--network", "deep", "--out", tmp_path / "no")
-
-
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [

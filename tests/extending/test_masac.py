@@ -99,16 +99,6 @@ def test_no_coefficient_is_the_plain_algorithm_and_each_part_of_the_prior_moves_
         assert not equal(plain, after(**{f"prior__{name}": value for name, value in choice.items()}))
 
 
-@both
-def test_a_seed_learns_the_same_alone_and_among_others(actions):
-    together, alone = soft(actions, seeds=(7, 8)), soft(actions, seeds=(8,))
-    for trained in (together, alone):
-        for _ in range(2):
-            trained.iterate(0.0)
-    for name, tensor in networks(alone).items():
-        torch.testing.assert_close(tensor[0], networks(together)[name][1], rtol=1e-4, atol=1e-5)
-
-
 @pytest.mark.parametrize("task", ["predator-prey", "wildlife"])
 def test_it_learns_with_rewards_of_the_agents_own_and_where_agents_end(task):
     trained = learner(MASAC, task)

@@ -126,9 +126,7 @@ def test_products_are_homomorphisms(legs, group: str, order: int) -> None:
     observation = layout(*seen(legs.LEGS).fields, Field("way", Kind.VECTOR), Field("marks", Kind.SCALAR, 2))
     whole = replace(spaces(legs.LEGS, group), observation=observation, state=joint_layout(observation, 3))
     elements = parse_group(group, 3).elements
-    assert (
-        len(elements) == {"legs*agents": 12, "d4*legs": 16, "legs*d4*agents": 96, "d4*legs*agents*marks-2": 192}[group]
-    )
+    assert len(elements) == order
     x, torque = torch.randn(3, observation.width), torch.randn(3, 2)
     chosen = elements if len(elements) < 20 else elements[:: len(elements) // 12]
     for g, h in itertools.product(chosen, chosen):
@@ -186,12 +184,6 @@ def test_what_does_not_commute_or_fit_is_refused(legs, monkeypatch) -> None:
     monkeypatch.delitem(plane.KIND_MATRICES, legs.LEGS)
     with pytest.raises(UserError, match="does not say how field 'knees' of kind legs turns"):
         build_transform(parse_elements("rot90*swap-legs", 3), spaces(legs.LEGS))
-
-
-def test_without_its_line_the_symmetry_is_unknown(legs) -> None:
-    parse.READERS.remove(legs.read_legs)
-    with pytest.raises(UserError, match="unknown transform 'legs'"):
-        transform_set("legs", spaces(legs.LEGS))
 
 
 def test_the_loop_of_the_page_augments_and_compares(legs) -> None:

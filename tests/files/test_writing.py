@@ -190,13 +190,7 @@ def test_a_signal_that_is_only_noted_in_the_middle_of_a_write_leaves_every_byte_
 
 @pytest.mark.parametrize(
     ("content", "mended"),
-    [
-        (b"", b""),
-        (b"a\nb\n", b"a\nb\n"),
-        (b"a\nb", b"a\n"),
-        (b"b", b""),
-        (b"a\n" + b"x" * 700_000, b"a\n"),
-    ],
+    [(b"", b""), (b"a\nb\n", b"a\nb\n"), (b"a\nb", b"a\n"), (b"b", b""), (b"a\n" + b"x" * 700_000, b"a\n")],
 )
 def test_a_torn_last_line_goes(tmp_path, content, mended):
     (tmp_path / "a").write_bytes(content)

@@ -44,9 +44,7 @@ def test_the_single_file_learns_with_the_four_lines_and_without(prior: bool, tmp
     assert loaded["main"](["--steps", "1600"]) == returns[:2], "the same seed gives the same run"
 
 
-def test_the_script_says_what_its_settings_are(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_script_says_what_its_settings_are(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["plain_mappo.py", "--help"])
     with pytest.raises(SystemExit) as ended:
         runpy.run_path(str(SCRIPT), run_name="__main__")

@@ -151,9 +151,7 @@ def test_what_cannot_be_played_or_drawn_is_refused(run: Run, tmp_path: Path, ask
         ({"device": "cuda:1"}, "there is no device 'cuda:1'; choose cpu, cuda or auto"),
     ],
 )
-def test_a_mistake_is_one_sentence_and_leaves_no_folder(
-    choice: dict[str, object], sentence: str, tmp_path: Path
-) -> None:
+def test_a_mistake_is_one_sentence_and_leaves_no_folder(choice, sentence, tmp_path):
     with pytest.raises(ValueError, match=sentence) as caught:
         train(**{"out": tmp_path / "run", **choice})  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
@@ -169,9 +167,7 @@ def test_what_is_not_a_run_is_refused(run: Run, tmp_path: Path) -> None:
         run.render(tmp_path / "film.txt")
 
 
-def test_a_name_that_another_program_takes_meanwhile_is_left_to_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_name_that_another_program_takes_meanwhile_is_left_to_it(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("time.strftime", lambda _: "20261125-090121")
     create, asked = RunFolder.create, []

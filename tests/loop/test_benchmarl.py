@@ -60,9 +60,7 @@ def weights(run: Experiment) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(("algorithm", "discrete"), [(MappoConfig, False), (IppoConfig, True), (QmixConfig, True)])
-def test_an_experiment_trains_on_copies(
-    tmp_path: Path, algorithm: Any, discrete: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_experiment_trains_on_copies(tmp_path, algorithm, discrete, monkeypatch):
     sizes: list[tuple[int, int]] = []
     ask = SymmetricLoss._ask
 

@@ -384,9 +384,7 @@ def test_the_vjp_is_that_of_autograd_through_the_layers(relax, relaxation, activ
     ("relax", "relaxation", "features", "between"),
     [(0.0, "weights", 23, 4232), (0.1, "weights", 16, 4096), (0.1, "residual", 23, 38088)],
 )
-def test_filter_banks_have_about_as_many_weights_as_a_plain_layer(
-    relax: float, relaxation: str, features: int, between: int
-) -> None:
+def test_filter_banks_have_about_as_many_weights_as_a_plain_layer(relax, relaxation, features, between):
     """A plain layer has 64^2 = 4096; 23^2 8, two banks of 16^2 8. A free layer beside 23 features has (23 8)^2 more."""
     spec, _, _ = scene("navigation")
     config = NETWORKS["equivariant"](hidden=(64, 64), group="d4", relax=relax, relaxation=relaxation)

@@ -99,16 +99,3 @@ def test_it_is_not_exported():
 def test_what_has_no_sets_is_refused():
     with pytest.raises(UserError, match="shows none with a place"):
         ordered(spaces(Field("goal", Kind.VECTOR)))
-
-
-@pytest.mark.parametrize("algorithm", ["mappo", "qmix"])
-def test_learners_train_with_it(algorithm):
-    small = {"mappo.num_envs": 4, "qmix.num_envs": 4, "qmix.batch_episodes": 4, "qmix.warmup_episodes": 2}
-    own = {name: value for name, value in small.items() if name.startswith(algorithm)}
-    overrides = {"network.name": "mlp", "network.order": "nearest", **own}
-    learner = build_learner(resolve_config("navigation", algorithm, overrides=overrides))
-    assert isinstance(learner.policy.actor, NearestFirst)
-    before = [p.clone() for p in learner.policy.parameters()]
-    for _ in range(3):
-        assert bool(learner.iterate(0.5).finite.all())
-    assert any(not torch.equal(p, q) for p, q in zip(learner.policy.parameters(), before, strict=True))

@@ -75,9 +75,7 @@ def test_elements_stay_with_the_probability_that_the_strength_says(choice) -> No
         (0.6, 0.5, {"rot90": 0.075, "rot180": 0.225, "flip-x": 0, "identity": 0.7}, 0.15),
     ],
 )
-def test_elements_are_drawn_by_their_weights_and_those_of_weight_1_do_not_fade(
-    certain: float, strength: float, expected: dict[str, float], share: float
-) -> None:
+def test_elements_are_drawn_by_their_weights_and_those_of_weight_1_do_not_fade(certain, strength, expected, share):
     weights = {"rot90": 0.2, "rot180": certain, "flip-x": 0.0}
     config = PriorConfig(transforms="rot90,rot180,flip-x", trust="measured", weights=weights, fade=1.0)
     prior = SymmetryPrior(config, make("navigation", 1, [0]).spec)

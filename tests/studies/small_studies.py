@@ -60,14 +60,6 @@ def final_evaluation(finals: list[float | None], seeds: Sequence[int] = SEEDS) -
     }
 
 
-def write_part(folder: StudyFolder, cell: Cell, training: bool) -> None:
-    """Write what training a cell leaves behind, or what evaluating it does."""
-    if training:
-        (folder.run_path(cell) / "policy.safetensors").write_bytes(b"weights")
-    else:
-        folder.evaluation_path(cell).write_text(json.dumps(final_evaluation([-1.0, -2.0, -3.0])))
-
-
 def write_study(path: Path, study: Study, finals: dict[str, list[float | None]]) -> StudyFolder:
     """Write a study whose runs of these variants are finished, with curves that rise to where they end."""
     folder = StudyFolder.create(path, study)

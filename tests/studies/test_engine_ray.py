@@ -124,9 +124,7 @@ def same(folder: StudyFolder, cell: Cell, alone: Path) -> bool:
     return rows[0] == rows[1] and policies[0] == policies[1]
 
 
-def test_a_lost_node_and_a_lost_worker_cost_a_checkpoint_and_change_no_result(
-    cluster: Cluster, folder: StudyFolder, engine: RayEngine, alone: dict[str, Path]
-) -> None:
+def test_a_lost_node_and_a_lost_worker_cost_a_checkpoint_and_change_no_result(cluster, folder, engine, alone):
     cell = folder.study.cells[1]
     lost: list[str] = []
 
@@ -163,9 +161,7 @@ def command(out: Path, cluster: Cluster) -> list[str]:
     return [sys.executable, "-c", "from esp_cli.app import main; main()", *map(str, words)]
 
 
-def test_a_killed_or_interrupted_driver_leaves_no_job_and_the_same_command_goes_on(
-    cluster: Cluster, tmp_path: Path, alone: dict[str, Path]
-) -> None:
+def test_a_killed_or_interrupted_driver_leaves_no_job_and_the_same_command_goes_on(cluster, tmp_path, alone):
     out = tmp_path / "s"
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "environments")]),
@@ -260,9 +256,7 @@ def test_a_cluster_of_this_machine_alone_has_a_token_and_no_other_machine_reache
     assert set(done.stdout.split()) <= loopback
 
 
-def test_a_run_that_no_node_has_room_for_fails_at_once(
-    folder: StudyFolder, engine: RayEngine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_that_no_node_has_room_for_fails_at_once(folder, engine, monkeypatch):
     monkeypatch.setattr(engine_ray, "process_bytes", lambda config, spec: 10**15)
     runs = scheduled(folder, engine, lambda _: True).runs
     assert [run.status for run in runs] == ["failed"] * 2
@@ -296,9 +290,7 @@ def test_a_cluster_that_does_not_answer_is_refused_in_one_sentence(folder: Study
             RayEngine(folder.path, address)
 
 
-def test_a_search_on_a_cluster_goes_on_after_a_stop_and_scores_as_on_this_machine(
-    cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_search_on_a_cluster_goes_on_after_a_stop_and_scores_as_on_this_machine(cluster, tmp_path, monkeypatch):
     pytest.importorskip("optuna", reason="needs Optuna, of the extra tune")
     from esp_cli.studies.search import Outcome, Search
 

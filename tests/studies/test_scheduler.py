@@ -14,7 +14,7 @@ import pytest
 from esp_cli.studies.engine import APPLICATION, LocalEngine
 from esp_cli.studies.scheduler import Scheduler, makespan
 from esp_cli.studies.study import StudyFolder
-from tests.studies.small_studies import small_study, stand_in, write_part, write_study
+from tests.studies.small_studies import small_study, stand_in, write_study
 
 ROOT = Path(__file__).parents[2]
 FOUR = ("navigation", "predator-prey")
@@ -214,67 +214,6 @@ def test_the_last_words_of_a_job_are_its_error_or_its_last_line(tmp_path):
 
     assert words("print('a'); print('error: no disk'); print('b')") == "no disk"
     assert words("raise ZeroDivisionError('by hand')") == "ZeroDivisionError: by hand"
-
-
-class FakeEngine:
-    """An engine without processes: a job writes what training or evaluation writes, and ends when it is asked to."""
-
-    def __init__(self, folder: StudyFolder, fails: str = "") -> None:
-        self.folder, self.fails, self.started, self.running = folder, fails, [], 0
-
-    def start(self, arguments, log):
-        self.started.append(tuple(arguments))
-        self.running += 1
-        return FakeJob(self, arguments)
-
-
-class FakeJob:
-    def __init__(self, engine: FakeEngine, arguments) -> None:
-        self.engine, self.polls, self.code, self.stopped = engine, 0, None, False
-        path = arguments[-1] if arguments[0] == "train" else arguments[1]
-        self.cell = next(c for c in engine.folder.study.cells if str(engine.folder.run_path(c)) == path)
-        self.trains = arguments[0] == "train"
-
-    def poll(self):
-        self.polls += 1
-        if self.code is None and (self.polls > 2 or self.stopped):
-            self.engine.running -= 1
-            self.code = 2 if self.cell.name == self.engine.fails else 130 if self.stopped else 0
-            if self.code == 0:
-                write_part(self.engine.folder, self.cell, self.trains)
-        return self.code
-
-    def ask_to_stop(self):
-        self.stopped = True
-
-    def kill(self):
-        self.stopped = True
-        self.poll()
-
-    def last_words(self):
-        return "the cluster is full"
-
-
-def test_another_engine_is_one_more_class(folder):
-    engine, most = FakeEngine(folder, fails=folder.study.cells[2].name), []
-    scheduler = run(folder, 3, engine, lambda snapshot: most.append(engine.running) or True)
-    assert scheduler.complete
-    assert statuses(scheduler) == ["finished", "finished", "failed", "finished"]
-    assert scheduler.runs[2].message == "the cluster is full"
-    assert max(most) == 3
-    path = str(folder.run_path(folder.study.cells[0]))
-    final = str(folder.evaluation_path(folder.study.cells[0]))
-    assert [command for command in engine.started if path in command] == [
-        ("train", "--resume", path),
-        ("eval", path, "--episodes", "4", "--json", final),
-    ]
-
-
-def test_every_job_of_another_engine_is_asked_to_stop(folder):
-    engine = FakeEngine(folder)
-    scheduler = run(folder, 2, engine, lambda snapshot: False)
-    assert statuses(scheduler) == ["stopped"] * 4
-    assert (len(engine.started), engine.running) == (2, 0)
 
 
 def test_when_the_last_job_ends():

@@ -86,9 +86,7 @@ def test_a_broken_task_has_less_symmetry_and_differs_in_one_setting(task: str, w
     assert (whole, broken) == ("d4", left)
 
 
-def test_what_a_task_cannot_take_is_left_out_with_a_reason_and_the_first_taken_is_the_reference(
-    tmp_path: Path,
-) -> None:
+def test_what_a_task_cannot_take_is_left_out_with_a_reason_and_the_first_taken_is_the_reference(tmp_path):
     asked = benchmark(tasks=("wildlife",), variants=("local frames", "plain", "frame averages"), budget=1)
     assert asked.taken == (("wildlife", "plain"), ("wildlife", "frame averages"))
     reason = asked.left_out["wildlife: local frames"]

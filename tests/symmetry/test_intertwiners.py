@@ -6,15 +6,7 @@ import numpy as np
 import pytest
 
 from esp_cli.symmetry import PlaneElement, cyclic, dihedral
-from esp_cli.symmetry.maps import (
-    Block,
-    action_blocks,
-    intertwiners,
-    layout_blocks,
-    regular,
-    trivial,
-    with_pixels,
-)
+from esp_cli.symmetry.maps import Block, action_blocks, intertwiners, layout_blocks, regular, trivial, with_pixels
 from esp_envs.spec import Field, Kind, layout
 from tests.symmetry.toy_actions import EVERYTHING, FOUR_DIRECTIONS
 

@@ -9,14 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from esp_cli.symmetry import (
-    Transform,
-    build_transform,
-    carried_groups,
-    mirror,
-    parse_elements,
-    rotation,
-)
+from esp_cli.symmetry import Transform, build_transform, carried_groups, mirror, parse_elements, rotation
 from esp_cli.symmetry.maps import Gather
 from esp_cli.symmetry.plane import PlaneElement, picture_sources
 from esp_envs import Environment, make

@@ -45,6 +45,7 @@ from tests.studies.test_tuner import search
 from tests.studies.test_tuning import tuning
 from tests.torture.junk import spoil_bytes, spoil_header, spoil_json, spoil_value
 from tests.torture.limits import PROCESSOR_S, TooLongError, time_limit
+from tests.torture.record import Part
 from tests.training.runs import tiny_folder
 
 BATCH = 100
@@ -75,8 +76,8 @@ class Kind:
     spoil: Callable[[bytes, random.Random], bytes]
 
 
-class Files:
-    """Batches of spoilt files; see `Part`."""
+class Files(Part):
+    """Batches of spoilt files."""
 
     def __init__(self, scratch: Path, seed: int) -> None:
         self.scratch, self.seed = scratch / "files", seed
@@ -84,12 +85,6 @@ class Files:
         self.sound = {name: (self.scratch / kind.path).read_bytes() for name, kind in KINDS.items()}
         self._originals = self._load_originals()
         self._most_bytes = _resident_bytes() + LIMIT_BYTES
-        self._done = 0
-
-    def count(self) -> int:
-        """Return the files since the last call."""
-        done, self._done = self._done, 0
-        return done
 
     def run(self, number: int) -> str | None:
         """Try a batch of one kind; its numbers follow from the seed and the number of the batch."""
@@ -99,7 +94,7 @@ class Files:
         try:
             for index in range(BATCH):
                 found = self._try(name, path, rng)
-                self._done += 1
+                self.done += 1
                 if found is not None:
                     keep = Path.cwd() / f"torture-{name}-{self.seed}-{number}-{index}"
                     shutil.copyfile(path, keep)

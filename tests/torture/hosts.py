@@ -17,6 +17,7 @@ from torch import Tensor
 
 from esp_cli import Continuous, Field, Items, Kind, Symmetry, discrete_moves, layout
 from esp_envs.errors import UserError
+from tests.torture.record import Part
 
 BATCH = 100
 SEEN = (
@@ -56,26 +57,21 @@ WRONG_NUMBERS: tuple[Callable[[Tensor], Any], ...] = (*WRONG[2:4], *WRONG[7:11],
 """Of numbers that go with their agents: they may be of any type."""
 
 
-class Hosts:
-    """Batches of calls; see `Part`."""
+class Hosts(Part):
+    """Batches of calls."""
 
     def __init__(self, scratch: Path, seed: int) -> None:
-        self.seed, self._done, self.kinds = seed, 0, []
+        self.seed, self.kinds = seed, []
         for seen, action, group in itertools.product(SEEN, ACTIONS, GROUPS):
             symmetry = Symmetry(observation=seen, action=action, group=group, num_agents=3, copies="all")
             self.kinds.append((f"{seen.summary} {group}", symmetry))
-
-    def count(self) -> int:
-        """Return the calls since the last call."""
-        done, self._done = self._done, 0
-        return done
 
     def run(self, number: int) -> str | None:
         """Try a batch."""
         rng = random.Random(f"{self.seed} {number}")
         torch.manual_seed(rng.getrandbits(32))
         for _ in range(BATCH):
-            self._done += 1
+            self.done += 1
             name, symmetry = rng.choice(self.kinds)
             wrong = _sound(symmetry, rng) if rng.random() < 0.4 else _wrong(symmetry, rng)
             if wrong:

@@ -16,6 +16,7 @@ from pathlib import Path
 from tests import faults
 from tests.forks import Job, fork, said, wait
 from tests.torture.disks import WHY_NOT, can_mount, start_on_full_disk, start_on_read_only_disk
+from tests.torture.record import Part
 from tests.torture.runs import all_configs, newest_step, run_job, run_state
 from tests.torture.studies import forked_study, kill_some, real_study, study_state
 
@@ -37,8 +38,8 @@ class Reference:
     seconds: float
 
 
-class Kills:
-    """Cases of one run or study each, interrupted several times; see `Part`."""
+class Kills(Part):
+    """Cases of one run or study each, interrupted several times."""
 
     def __init__(self, scratch: Path, seed: int) -> None:
         self.scratch, self.seed = scratch / "kills", seed
@@ -47,14 +48,8 @@ class Kills:
         gc.collect()
         gc.freeze()  # forks do not clean up what is this process's
         self._references: dict[str, Reference] = {}
-        self._kills = 0
         if not can_mount():
             print(f"{WHY_NOT}; the size of files is limited instead", flush=True)
-
-    def count(self) -> int:
-        """Return the interruptions since the last call that took effect: a process did not end with exit code 0."""
-        done, self._kills = self._kills, 0
-        return done
 
     def run(self, number: int) -> str | None:
         """Interrupt a run or a study again and again, let it end, and compare it with one that was not disturbed."""
@@ -80,7 +75,7 @@ class Kills:
         for _ in range(rng.randint(1, MAX_INTERRUPTIONS)):
             disturb = kill_some if study and rng.random() < 0.5 else interrupt
             how, code = disturb(rng, job, path, reference.seconds)
-            self._kills += code != 0
+            self.done += code != 0
             history.append(f"{how} -> {code}")
             step = newest_step(path)
             wrong_code = how.split()[-1] in FAULTS_OF_THE_DISK and code not in (0, 1)
@@ -130,11 +125,7 @@ def interrupt(rng: random.Random, job: Job, path: Path, seconds: float) -> tuple
 
 
 def _with(
-    job: Job,
-    path: Path,
-    fault: faults.Fault | None = None,
-    file_bytes: int = -1,
-    clock_back: bool = False,
+    job: Job, path: Path, fault: faults.Fault | None = None, file_bytes: int = -1, clock_back: bool = False
 ) -> None:
     if fault is not None:
         fault.plan()

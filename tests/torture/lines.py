@@ -25,6 +25,7 @@ from esp_cli.training.config import EvaluationConfig
 from esp_envs.registry import task_class, task_names
 from tests.bodies.models import biped
 from tests.torture.limits import PROCESSOR_S, TooLongError, time_limit
+from tests.torture.record import Part
 
 BATCH = 10
 WORDS = ("x", "-", "--", "é", "a b", "../../x", "$(x)", "`x`", "x" * 3000, "\udcff", "[bold]", "0x10", "1,", ",", "=a")
@@ -48,8 +49,8 @@ VALUES = (
 )
 
 
-class Lines:
-    """Batches of wrong command lines; see `Part`."""
+class Lines(Part):
+    """Batches of wrong command lines."""
 
     def __init__(self, scratch: Path, seed: int) -> None:
         self.scratch, self.seed = scratch / "lines", seed
@@ -60,13 +61,8 @@ class Lines:
         """Good ones, by command and name."""
         self.commands = {name: build_command(name, target) for name, target in COMMANDS.items()}
         self.settings = dict(_settings())
-        self._runner, self._done = CliRunner(), 0
+        self._runner = CliRunner()
         train._train = lambda *_: None  # a run that can begin is not a wrong line
-
-    def count(self) -> int:
-        """Return the command lines since the last call."""
-        done, self._done = self._done, 0
-        return done
 
     def run(self, number: int) -> str | None:
         """Try a batch."""
@@ -74,7 +70,7 @@ class Lines:
         for _ in range(BATCH):
             with _inside(self.scratch):
                 words = self._setting_line(rng) if rng.random() < 0.5 else self._option_line(rng)
-                self._done += 1
+                self.done += 1
                 wrong = self._try(words)
                 left = [entry.name for entry in self.scratch.iterdir()]
                 if left:

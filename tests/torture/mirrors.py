@@ -27,6 +27,7 @@ from esp_cli.bodies.proof import prove
 from esp_cli.bodies.walking import quadruped
 from tests.bodies.models import QUADRUPED, biped, legged
 from tests.bodies.test_fields import anymal
+from tests.torture.record import Part
 
 HISTORY = 3
 _FILES = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
@@ -46,21 +47,16 @@ MODELS: dict[str, Callable[[], mujoco.MjModel]] = {
 ROBOTS = (*MODELS, "anymal")
 
 
-class Mirrors:
-    """Robots with a right mirror and wrong ones; see `Part`.
+class Mirrors(Part):
+    """Robots with a right mirror and wrong ones.
 
     Attributes:
         counts: wrong mirrors by robot and kind of mistake.
     """
 
     def __init__(self, scratch: Path, seed: int) -> None:
-        self.seed, self._done, self._kept = seed, 0, dict[str, tuple[Frame | None, Body]]()
+        self.seed, self._kept = seed, dict[str, tuple[Frame | None, Body]]()
         self.counts: dict[tuple[str, str], int] = {}
-
-    def count(self) -> int:
-        """Return the wrong mirrors since the last call."""
-        done, self._done = self._done, 0
-        return done
 
     def run(self, number: int) -> str | None:
         """Try a robot with one element."""
@@ -85,7 +81,7 @@ class Mirrors:
         return None
 
     def _add(self, robot: str, kind: str) -> None:
-        self._done += 1
+        self.done += 1
         self.counts[robot, kind] = self.counts.get((robot, kind), 0) + 1
 
     def _robot(self, name: str) -> tuple[Frame | None, Body]:

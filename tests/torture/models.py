@@ -31,6 +31,7 @@ from tests.bodies.models import QUADRUPED, biped, legged
 from tests.bodies.test_reading import URDF
 from tests.forks import fork, wait
 from tests.torture.junk import spoil_bytes
+from tests.torture.record import Part
 
 ELEMENTS = 10_000  # at most, of one model
 BATCH = 5
@@ -92,12 +93,12 @@ def numbers(body):
 """
 
 
-class Models:
-    """Batches of hostile models; see `Part`."""
+class Models(Part):
+    """Batches of hostile models."""
 
     def __init__(self, scratch: Path, seed: int) -> None:
         self.scratch, self.seed = scratch / "models", seed
-        self.folder, self._done = self.scratch / "robot", 0
+        self.folder = self.scratch / "robot"
         outside = self.scratch / "outside"
         self.folder.joinpath("folder.stl").mkdir(parents=True)
         outside.mkdir()
@@ -123,16 +124,11 @@ class Models:
             self._watch, bytes(outside), 0x3 | 0x20 | 0x3C0
         )  # read, written, opened, moved, made, removed
 
-    def count(self) -> int:
-        """Return the models since the last call."""
-        done, self._done = self._done, 0
-        return done
-
     def run(self, number: int) -> str | None:
         """Try a batch."""
         rng = random.Random(f"{self.seed} {number}")
         for index in range(BATCH):
-            content, self._done = self._model(rng), self._done + 1
+            content, self.done = self._model(rng), self.done + 1
             path = self.folder / rng.choice(("robot.xml", "robot.xml", "a'''\n\"\"\"*.xml", "robot.urdf"))
             path.write_bytes(content)
             try:

@@ -93,11 +93,6 @@ def test_policy_files_have_their_description_at_the_top_level(tmp_path):
         load_checkpoint(path)
 
 
-def test_meta_is_seen_as_json_shows_it(tmp_path):
-    save_checkpoint(tmp_path / "a", {}, {"pair": (1, 2), "table": {10: "x", 9: "y"}})
-    assert load_checkpoint(tmp_path / "a") == ({}, {"pair": [1, 2], "table": {"10": "x", "9": "y"}})
-
-
 @pytest.mark.parametrize(
     ("content", "meta", "text"),
     [

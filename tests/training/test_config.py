@@ -74,12 +74,7 @@ def test_what_a_preset_sets_for_its_network_is_left_out_for_another_that_does_no
         ("predator-prey", "maddpg", {"task.actions": "continuous"}, {"maddpg.actor_gradient"}),
         ("formation", "maddpg", {}, {"maddpg.actor_gradient"}),
         ("formation", "maddpg", {"task.num_obstacles": 0}, {"maddpg.actor_gradient", "task.obstacle_radius_m"}),
-        (
-            "predator-prey",
-            "qmix",
-            {"network.layer_norm": True},
-            {"network.precision", "network.compiled"},
-        ),
+        ("predator-prey", "qmix", {"network.layer_norm": True}, {"network.precision", "network.compiled"}),
         (
             "predator-prey",
             "maddpg",
@@ -171,19 +166,6 @@ def test_a_stored_network_that_is_damaged_is_one_sentence(network, sentence):
     assert "\n" not in str(caught.value)
 
 
-def test_overrides_may_be_text_as_on_the_command_line():
-    texts = {
-        "network.hidden": "[32, 16]",
-        "mappo.clip_value": "true",
-        "task.actions": "continuous",
-        "prior.kind": "none",
-    }
-    config = resolve_config("navigation", overrides=texts)
-    assert (config.network.hidden, config.prior.kind) == ((32, 16), "none")
-    assert config.algorithm_settings["clip_value"] is True
-    assert config.task_settings["actions"] == "continuous"
-
-
 @pytest.mark.parametrize(
     ("task", "algorithm", "overrides", "actions"),
     [
@@ -248,21 +230,6 @@ def test_what_is_unknown_or_out_of_range_is_one_sentence(choice, sentence):
     with pytest.raises(ValueError, match=re.escape(sentence)) as caught:
         resolve_config(**asked)
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("task", "choice"),
-    [
-        ("navigation", {}),
-        ("navigation", {"preset": "paper", "seeds": (3, 7), "steps": 500_000}),
-        ("predator-prey", {"overrides": {"task.prey": "fleeing", "network.hidden": [16], "prior.transforms": "rot90"}}),
-    ],
-)
-def test_a_stored_configuration_is_read_back_as_it_was(task, choice):
-    config = resolve_config(task, **choice)
-    stored = json.loads(json.dumps(config.model_dump(mode="json"), allow_nan=False))
-    assert parse_config(stored, Path("run")) == config
-    assert isinstance(parse_config(stored, Path("run")), RunConfig)
 
 
 def test_a_stored_configuration_gets_the_settings_that_came_later_and_keeps_its_own() -> None:

@@ -10,14 +10,7 @@ import pytest
 import torch
 
 from esp_cli.training import metrics
-from esp_cli.training.metrics import (
-    MetricsError,
-    MetricsWriter,
-    column,
-    read_last_row,
-    read_metrics,
-    truncate_metrics,
-)
+from esp_cli.training.metrics import MetricsError, MetricsWriter, column, read_last_row, read_metrics, truncate_metrics
 
 ROWS = [
     {"step": 100, "train/loss": [1.0, 2.0], "time/seconds": 0.5},

@@ -143,13 +143,6 @@ def test_checkpoints_that_a_kill_left_beside_the_trained_policy_go_at_the_next_s
     assert names(folder) == ["step-000000000300-final.safetensors"]
 
 
-def test_the_latest_checkpoint_is_that_of_the_highest_step(folder):
-    write_checkpoints(folder, 900, 1000)
-    tensors, meta = folder.latest_checkpoint(pytest.fail)
-    assert meta == {"iteration": 10, "step": 1000}
-    assert tensors["weight"].tolist() == [1000.0] * 4
-
-
 @pytest.mark.parametrize("damage", ["flip", "cut", "empty", "renamed"])
 def test_a_damaged_newest_checkpoint_is_passed_over_with_a_note(folder, damage):
     write_checkpoints(folder, 100, 200)

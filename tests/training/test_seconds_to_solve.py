@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.benchmarks.seconds_to_solve import CASES, Case, reached, run, spread
+from tests.benchmarks.seconds_to_solve import CASES, Case, reached, run
 from tests.cli.running import esp
 from tests.training.runs import TINY
 
@@ -55,7 +55,3 @@ def test_seconds_count_to_the_first_evaluation_that_reaches_the_threshold() -> N
     assert run(hard, hard.words(0), ROOT).seconds == math.inf
     with pytest.raises(RuntimeError, match="has no preset 'best'"):
         run(easy, easy.words(0, ["--preset", "best"]), ROOT)
-
-
-def test_the_table_has_the_median_and_both_ends() -> None:
-    assert spread([3.0, 1.0, math.inf], ".1f") == "3.0 (1.0 to inf)"

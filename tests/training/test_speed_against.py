@@ -7,15 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.benchmarks.against import (
-    CASES,
-    NO_EVALUATION,
-    Training,
-    measure,
-    python,
-    steps_per_second,
-    use,
-)
+from tests.benchmarks.against import CASES, NO_EVALUATION, Training, measure, python, steps_per_second, use
 from tests.cli.running import esp
 from tests.training.runs import TINY
 

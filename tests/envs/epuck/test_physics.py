@@ -141,17 +141,6 @@ def test_what_is_read_is_memory_of_its_own(name: str) -> None:
 
 
 @every_engine
-def test_a_period_that_no_whole_number_of_time_steps_fills_is_refused(name: str) -> None:
-    with pytest.raises(ValueError, match=r"0\.015 s is not a multiple of 0\.01 s"):
-        make_physics(name, OPEN, 1, 0.015)
-
-
-def test_an_unknown_engine_is_refused() -> None:
-    with pytest.raises(ValueError, match="unknown physics 'bullet'; there are mujoco, mujoco-3d, pymunk"):
-        make_physics("bullet", OPEN, 1, PERIOD_S)
-
-
-@every_engine
 def test_a_missing_library_is_named(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     library = name.partition("-")[0]
     for module in list(sys.modules):

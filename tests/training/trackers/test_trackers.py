@@ -56,9 +56,7 @@ class Failing:
 
 
 @pytest.mark.parametrize("way", ["open", "write", "close"])
-def test_a_tracker_that_fails_is_one_line_and_the_run_goes_on(
-    finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str
-) -> None:
+def test_a_tracker_that_fails_is_one_line_and_the_run_goes_on(finished, tmp_path, monkeypatch, way):
     monkeypatch.setitem(trackers.TRACKERS, "wandb", Failing)
     monkeypatch.setattr(trackers, "find_spec", lambda name: True)
     monkeypatch.setattr(Failing, "way", way)
@@ -76,9 +74,7 @@ def test_a_tracker_that_fails_is_one_line_and_the_run_goes_on(
     assert len(read_metrics(tmp_path / "run" / "metrics.jsonl")) == 4
 
 
-def test_a_missing_package_is_one_sentence_before_there_is_a_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, copied: Path
-) -> None:
+def test_a_missing_package_is_one_sentence_before_there_is_a_folder(tmp_path, monkeypatch, copied):
     monkeypatch.setattr(trackers, "find_spec", lambda name: None)
     sentence = "mlflow is not installed: pip install 'mlflow-skinny>=2.16', or leave out --track mlflow"
     assert refused("train", "--out", tmp_path / "run", "--track", "mlflow") == sentence
