@@ -41,7 +41,6 @@ def nothing_left() -> Iterator[None]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip what needs a GPU where there is none."""
     if torch.cuda.is_available():
         return
     for item in items:

@@ -154,11 +154,9 @@ class ForkJob:
             os.kill(self.pid, signal.SIGTERM)
 
     def kill(self) -> None:
-        """End it at once."""
         if self.poll() is None:
             os.kill(self.pid, signal.SIGKILL)
             self._code = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
 
     def last_words(self) -> str:
-        """Return the end of its log."""
         return self.log.read_text(errors="replace")[-300:]

@@ -134,7 +134,6 @@ QUESTIONS = [
 
 
 def read_first(page: Path, anchor: str) -> str:
-    """Return the first words that a reader reads of a page, from the heading of an anchor on."""
     text = page.read_text(encoding="utf-8")
     for heading in re.finditer(r"^#+ (.+)$", text, re.MULTILINE) if anchor else ():
         if re.sub(r"[^\w\- ]", "", heading[1].lower()).replace(" ", "-") == anchor:

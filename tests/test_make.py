@@ -34,7 +34,6 @@ def checkout(tmp_path: Path) -> Path:
 
 
 def make(checkout: Path, *targets: str, user: int | None = None) -> str:
-    """Run make and return what it called."""
     result = subprocess.run(
         ["make", *targets], cwd=checkout, capture_output=True, text=True, check=False, timeout=60, user=user
     )

@@ -24,7 +24,6 @@ TASK = "tests.leaving:Leaving"
 
 @pytest.fixture(autouse=True)
 def registered(monkeypatch):
-    """Register the tasks of this file, for this file alone."""
     monkeypatch.setattr(TASKS, "_registered", {})
     assert register(Leaving) == TASK
 

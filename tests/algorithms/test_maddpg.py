@@ -28,7 +28,6 @@ class LinearCritic(MLP):
 
 
 def linear_critic(trained, weights):
-    """Replace the critic and its target by a linear one."""
     inputs = trained.critic.layers[0].weight.shape[1]
     trained.critic, trained.target_critic = (LinearCritic(inputs, weights) for _ in range(2))
 

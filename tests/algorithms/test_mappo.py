@@ -46,14 +46,6 @@ def test_no_copies_and_no_coefficient_is_the_plain_algorithm_bit_for_bit():
     assert not equal(plain, spoken), "negative control: a coefficient does change the run"
 
 
-@pytest.mark.parametrize("network", ["mlp", "gru"])
-@pytest.mark.parametrize("kind", ["none", "esp"])
-def test_same_seed_same_run(network, kind):
-    first, _ = after(network__name=network, prior__kind=kind)
-    second, _ = after(network__name=network, prior__kind=kind)
-    assert equal(first, second)
-
-
 WIDE = {"network__hidden": [64, 64]}
 
 

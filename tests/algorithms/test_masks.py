@@ -31,7 +31,6 @@ ALL = torch.ones_like(ALLOWED)
 
 @pytest.fixture(autouse=True)
 def registered(monkeypatch):
-    """Register the tasks of this file, for this file alone."""
     monkeypatch.setattr(TASKS, "_registered", {})
     assert register(Fenced) == TASK
 

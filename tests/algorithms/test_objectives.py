@@ -135,8 +135,6 @@ def test_the_gradient_is_that_of_autograd_to_rounding(choice, compiled):
 
 
 def other(**changes):
-    """Return what changes settings of learner or prior."""
-
     def change(trained, made):
         for name, value in changes.items():
             if name == "augments":
@@ -172,7 +170,6 @@ class Alone(WithVJP):
 
 
 def slopes(loss, *returned):
-    """Return the slopes of a loss by what networks returned."""
     loss.gradients([])
     return [x.slope for x in returned]
 

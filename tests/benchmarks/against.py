@@ -135,7 +135,6 @@ def paths(tree: Path) -> dict[str, str]:
 
 
 def python(tree: Path, folder: Path, *arguments: str) -> str:
-    """Run Python on the code of `tree`, in `folder`, and return what it prints."""
     command = [sys.executable, *arguments]
     done = subprocess.run(command, cwd=folder, env=paths(tree), capture_output=True, text=True, check=False)
     if done.returncode:
@@ -157,7 +156,6 @@ def checked_out(commit: str) -> Iterator[Path]:
 
 
 def measure(case: Case, tree: Path, chosen: Sequence[str] = ()) -> float:
-    """Return the rate of a case with the code of `tree`, in a temporary folder."""
     with tempfile.TemporaryDirectory() as folder:
         return case.measure(tree, Path(folder), chosen)
 

@@ -118,7 +118,6 @@ def _task_of(row: dict[str, Any]) -> str:
 
 
 def page(rows: list[dict[str, Any]]) -> str:
-    """Return the page."""
     text = Path(__file__).with_name("atlas_page.md").read_text()
     lines = ["| task | found | what breaks the others |", "|---|---|---|"]
     order = {(package, name): k for k, (package, name, *_) in enumerate(tasks())}

@@ -66,7 +66,6 @@ def hoard(self: ParallelTask, env: Any) -> Any:
 
 
 def heap(self: ParallelTask, env: Any, state: Any) -> None:
-    """Put all that there."""
     agents, start = teams(env), 0
     for some in (agents[:6], agents[6:]):
         rows = state[start : start + 4 * len(some)].reshape(2, len(some), 2)
@@ -168,7 +167,6 @@ MORE_ROBOTS = ("HumanoidStandup-v5", "Hopper-v5")
 
 
 def robot(name: str) -> type[SingleAgentTask]:
-    """Return the task of such a robot."""
     from esp_cli.bodies.gymnasium import MujocoTask
 
     return type(name.partition("-")[0], (MujocoTask,), {"scenario": name, "convention": name, "terminates": True})
@@ -200,7 +198,6 @@ class Foraging(ParallelTask):
     symmetry, convention, terminates = "c1", "Foraging-8x8-2p-3f-v3", True
 
     def make_one(self) -> Any:
-        """Return the environment."""
         from lbforaging.foraging import ForagingEnv
 
         return ForagingEnv(
@@ -216,7 +213,6 @@ class Foraging(ParallelTask):
         return np.concatenate([seen[:3].ravel(), seen[3:, :3].ravel()])
 
     def take(self, env: Any) -> Any:
-        """Return what the environment holds."""
         bare = env.unwrapped
         found = [(row, column, bare.field[row, column]) for row, column in zip(*np.nonzero(bare.field), strict=True)]
         players = [(*player.position, player.level) for player in bare.players]

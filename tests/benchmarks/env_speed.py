@@ -47,7 +47,6 @@ def figures(play: Callable[[], object], steps: int, seconds: float, runs: int) -
 
 
 def play_episode(env: Environment) -> None:
-    """Take as many random actions as an episode has."""
     for _ in range(env.spec.horizon):
         env.step(env.random_action())
     if env.device.type == "cuda":
@@ -57,7 +56,6 @@ def play_episode(env: Environment) -> None:
 def measure(
     tasks: list[str], worlds: list[int], settings: dict[str, object], device: str, seconds: float, runs: int
 ) -> list[dict[str, object]]:
-    """Return one record per task and number of worlds."""
     records: list[dict[str, object]] = []
     for task in tasks:
         for count in worlds:

@@ -70,7 +70,6 @@ SUBJECTS = {"physics": of_physics, "formation": of_formation}
 def measure(
     engines: list[str], subjects: list[str], worlds: int, threads: list[int], seconds: float, runs: int
 ) -> list[dict[str, object]]:
-    """Return one record per subject, engine and number of threads."""
     records: list[dict[str, object]] = []
     for subject, engine, count in itertools.product(subjects, engines, threads):
         found = figures(SUBJECTS[subject](engine, worlds, count), worlds, seconds, runs)

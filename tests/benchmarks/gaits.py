@@ -67,7 +67,6 @@ def measured(path: Path) -> dict[str, object]:
 
 
 def draw(found: dict[str, dict[str, dict]], path: Path) -> None:
-    """Draw the mean return over steps with its 95 % interval, and the gaits' differences below."""
     figure, axes = plt.subplots(2, len(found), figsize=(4 * len(found), 6), squeeze=False, layout="constrained")
     for (task, runs), (above, below) in zip(found.items(), axes.T, strict=True):
         for k, (name, run) in enumerate(runs.items()):

@@ -134,7 +134,6 @@ def fit(samples: Sequence[Sample], warmup_min: float, exit_code: int) -> Growth:
 
 
 def table(samples: Sequence[Sample], rows: int = 13) -> str:
-    """Return some of the samples as text."""
     step = max(1, (len(samples) - 1) // (rows - 1))
     lines = [f"{'minute':>8} {'RSS MB':>9} {'anon MB':>9} {'files':>6} {'threads':>8} {'processes':>10}"]
     lines += [

@@ -60,14 +60,12 @@ class Record(Callback):
         self.trained_s, self.since = 0.0, 0.0
 
     def on_batch_collected(self, batch: Any) -> None:
-        """Read the returns of the episodes that ended."""
         ended = batch["next", "done"].squeeze(-1)
         returns = batch["next", "agents", "episode_reward"][ended].mean().item()
         self.rows.append((self.experiment.total_frames, returns, self.trained_s))
         self.since = time.perf_counter()
 
     def on_train_end(self, training_td: Any, group: str) -> None:
-        """Add the time of the update."""
         self.trained_s += time.perf_counter() - self.since
 
 

@@ -39,13 +39,11 @@ def rate(overrides: dict[str, object], seeds: int = 1) -> float:
 
 
 def crowd(agents: int) -> dict[str, object]:
-    """Return the settings of so many agents."""
     near = {"task.sees": 8, "task.density": 8, "mappo.critic_input": "own"} if agents > 8 else {}
     return SET | near | {"task.num_agents": agents, "mappo.num_envs": max(1, 1000 // agents)}
 
 
 def side_by_side(processes: int, threads: int) -> float:
-    """Return the seed-steps a second of all processes that train side by side."""
     with tempfile.TemporaryDirectory() as folder:
         files = [Path(folder) / str(k) for k in range(processes)]
         command = [sys.executable, str(BESIDE), "--cases", "mappo default, esp", "--seeds", "10", "--iterations", "25"]

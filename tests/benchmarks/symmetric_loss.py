@@ -34,7 +34,6 @@ def perceptron(inputs: int, outputs: int) -> nn.Sequential:
 
 
 def build() -> ClipPPOLoss:
-    """Return a loss on nested keys."""
     keys = {"loc": ("agents", "loc"), "scale": ("agents", "scale")}
     body = nn.Sequential(perceptron(SEEN.width, 4), NormalParamExtractor())
     net = TensorDictModule(body, [("agents", "observation")], list(keys.values()))
@@ -47,7 +46,6 @@ def build() -> ClipPPOLoss:
 
 
 def rows(count: int) -> TensorDict:
-    """Return random experience."""
     lead = (count, AGENTS)
     agents = {"observation": torch.randn(*lead, SEEN.width), "action": torch.rand(*lead, 2) - 0.5}
     agents |= {

@@ -108,7 +108,6 @@ def matrix_rate(seeds: int, rows: int, precision: str, device: str, repeats: int
 def timed(
     algorithm: str, overrides: dict[str, object], seeds: int, iterations: int, device: str
 ) -> tuple[Learner, list[float]]:
-    """Return a learner of navigation and its seed-steps a second in each of `iterations` iterations."""
     config = resolve_config("navigation", algorithm, seeds=range(seeds), overrides=overrides, device=device)
     learner = build_learner(config)
     for _ in range(WARM_UP):
@@ -122,7 +121,6 @@ def timed(
 
 
 def measure(name: str, seeds: int, iterations: int, device: str) -> dict[str, object]:
-    """Time `iterations` iterations of one case."""
     algorithm, overrides = CASES[name]
     learner, rates = timed(algorithm, overrides, seeds, iterations, device)
     record: dict[str, object] = {

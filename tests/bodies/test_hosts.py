@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-
 import mujoco
 import numpy as np
 import pytest
@@ -13,6 +11,7 @@ from esp_cli import Body
 from esp_cli.bodies.emitting import emitted
 from esp_cli.bodies.numbers import numbers_of
 from tests.bodies.models import biped
+from tests.bodies.test_emitting import imported
 
 gymnasium = pytest.importorskip("gymnasium")
 
@@ -34,11 +33,7 @@ class Walk(gymnasium.Env):
 @pytest.fixture
 def my_mirror(tmp_path):
     body = Body.from_mjcf(mujoco.MjModel.from_xml_string(biped()))
-    (tmp_path / "mirror.py").write_text(emitted(body, numbers_of(body, None), "biped.xml"))
-    spec = importlib.util.spec_from_file_location("my_mirror", tmp_path / "mirror.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return imported(emitted(body, numbers_of(body, None), "biped.xml"), tmp_path, "my_mirror")
 
 
 def look(module, obs, actions, numbers, batch):

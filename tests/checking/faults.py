@@ -26,8 +26,6 @@ class Fault:
 
 
 class Faulty(Environment):
-    """An environment with a fault."""
-
     def __init__(self, inner: Environment, fault: Fault) -> None:
         super().__init__(TaskSettings(), inner.num_envs, inner.generators)
         self.inner, self.fault = inner, fault
@@ -78,8 +76,6 @@ def field_of(name: str, change: Callable[[Tensor], Tensor]) -> Fault:
 
 
 def declared(change: Callable[[Field], Field], *names: str) -> Fault:
-    """Declare fields of the observation as something else."""
-
     def told(spec: TaskSpec) -> TaskSpec:
         fields = tuple(change(f) if f.name in names else f for f in spec.observation.fields)
         return replace(spec, observation=Layout(fields))

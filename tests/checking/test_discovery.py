@@ -164,13 +164,11 @@ def test_what_is_found_is_complete_in_whatever_order_fields_stand() -> None:
 
 @cache
 def windy() -> dict[str, np.ndarray]:
-    """Return transitions of navigation with forces."""
     data = collect(make("navigation", 128, [0], {"actions": "continuous", "wind": 0.3}), 1536)
     return {name: getattr(data, name).numpy() for name in ("obs", "action", "reward", "next_obs")}
 
 
 def recorded(folder: Path, **changes: object) -> Path:
-    """Write transitions, some of them changed."""
     arrays = windy() | changes
     path = folder / "transitions.npz"
     np.savez(path, **{name: array for name, array in arrays.items() if array is not None})
@@ -369,12 +367,6 @@ def test_declared_orders_of_landmarks_are_checked(settings, outcome, monkeypatch
     assert len(found) == (3 if outcome == "holds" else 1), "each exchange of two"
     assert {(one.declared, one.outcome) for one in found} == {(True, outcome)}
     assert ("landmarks-" in report.found) == (outcome == "holds")
-
-
-def test_an_unknown_field_is_refused() -> None:
-    sentence = "navigation has no field 'islands', but velocity, position, landmarks, others"
-    assert sentence in refused("discover", "navigation", "--transforms", "islands-1-0")
-    assert sentence in refused("check", "symmetry", "navigation", "--transforms", "islands-1-0")
 
 
 def test_where_nothing_is_found_there_is_no_prior() -> None:

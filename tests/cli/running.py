@@ -54,7 +54,6 @@ def printed(*options: object) -> dict[str, Any]:
 
 
 def written(path: Path, content: object) -> Path:
-    """Write a file, content that is no text as JSON, and return its path."""
     path.write_text(content if isinstance(content, str) else json.dumps(content))
     return path
 

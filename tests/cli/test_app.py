@@ -53,7 +53,6 @@ def toy(
 
 @pytest.fixture
 def commands(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Register the toy command, and one whose module does not import."""
     module = types.ModuleType("toy_command")
     module.toy = toy  # type: ignore[attr-defined]
     module.EPILOG = "Example: esp toy fine --steps 20k"  # type: ignore[attr-defined]

@@ -149,27 +149,6 @@ def test_a_folder_may_have_an_equals_sign_in_its_name(finished: Path, copied: Pa
         assert result["cells"][0]["variant"] == label
 
 
-def test_runs_of_different_tasks_do_not_compare(finished: Path, tmp_path: Path) -> None:
-    hunt = train_tiny(tmp_path / "hunt", "--task", "predator-prey", steps=50)
-    two = train_tiny(tmp_path / "two", "--set", "task.num_agents=2", steps=50)
-    for other in (hunt, two):
-        assert "different tasks or task settings" in refused("report", finished, other)
-
-
-@pytest.mark.parametrize(
-    ("content", "sentence"),
-    [
-        ("", "no row has the metric 'eval/return_greedy'"),
-        ('{"step": 0, "eval/return_greedy": [1.0]}\n', "its metrics have 1 seeds, its configuration 2"),
-        ('{"step": 0, "eval/return_greedy": ["high", 1]}\n', "a value that is not a number"),
-        ("train more\nsleep less\n", "line 1 is not a row of metrics"),
-    ],
-)
-def test_damaged_metrics_are_told_in_one_sentence(copied: Path, content: str, sentence: str) -> None:
-    (copied / "metrics.jsonl").write_text(content)
-    assert sentence in refused("report", copied)
-
-
 @pytest.mark.parametrize("option", ["--json", "--results"])
 def test_what_a_run_or_a_study_needs_is_not_overwritten_by_a_report(copied: Path, tmp_path: Path, option: str) -> None:
     study = tmp_path / "study"

@@ -56,8 +56,6 @@ NOT_ASKED = ("the state leaves out ", "what is seen has chance")
 
 @dataclass(frozen=True)
 class Case:
-    """A task with settings."""
-
     task: str
     settings: Mapping[str, object]
 

@@ -19,5 +19,4 @@ def line(count=9, trail=True):
 
 
 def episode(scenes):
-    """Return an episode that earns 1 a step."""
     return Episode(scenes, [float(k) for k in range(len(scenes))])

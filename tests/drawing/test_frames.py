@@ -22,7 +22,6 @@ TEAM = scene(Body((0.0, 0.5), 0.1, RED, label="robot"), Body((0.5, 0.0), 0.1, GR
 
 @pytest.fixture
 def written(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Return every text that is drawn from now on."""
     texts: list[str] = []
     write = frames.ImageDraw.ImageDraw.text
     frames._legend.cache_clear()

@@ -42,7 +42,6 @@ def env(trained):
 
 
 def filmed(trained, seed, *choice):
-    """Record the episodes of one seed."""
     (own,) = record([trained.single_seed(seed)], *choice)
     return own
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
+import runpy
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,14 +23,7 @@ from tests.own_tasks import lines_of, page_files, save_page_files
 def rendezvous(tmp_path_factory: pytest.TempPathFactory) -> type[Environment]:
     folder = tmp_path_factory.mktemp("page")
     save_page_files(folder)
-    return load(folder / "rendezvous.py").Rendezvous
-
-
-def load(path: Path):
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return runpy.run_path(str(folder / "rendezvous.py"))["Rendezvous"]
 
 
 def worlds(cls: type[Environment], num_envs: int = 5, seeds: Sequence[int] = (3, 7), **settings) -> Environment:
@@ -46,7 +39,7 @@ def test_the_task_of_the_page_keeps_every_promise(rendezvous: type[Environment])
 def test_the_task_of_the_page_that_ends_early_keeps_every_promise(tmp_path: Path, monkeypatch) -> None:
     save_page_files(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    meeting = load(tmp_path / "meeting.py").Meeting
+    meeting = runpy.run_path(str(tmp_path / "meeting.py"))["Meeting"]
     findings = list(check(Subject(lambda num_envs, seeds: worlds(meeting, num_envs, seeds))))
     assert [finding for finding in findings if finding.broken] == []
     env = worlds(meeting, 20)
@@ -354,7 +347,6 @@ class NoRestart(Plain):
 
 
 def plain(**methods: object) -> type[Environment]:
-    """Return the plain task with other methods."""
     return type("_".join(methods), (Plain,), methods)
 
 

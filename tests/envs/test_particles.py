@@ -15,7 +15,6 @@ PAIR = Bodies(radius=(0.15, 0.15), gain=(5.0, 5.0), max_speed=None, contacts=((0
 
 
 def worlds_with(bodies: Bodies, positions: list[list[float]], velocity_first: bool = True) -> ParticleWorlds:
-    """Return one world with the entities at rest at `positions`."""
     worlds = ParticleWorlds(bodies, 1, CPU, velocity_first)
     worlds.entity[:, :, 0] = torch.tensor(positions)
     worlds.measure()

@@ -59,7 +59,6 @@ def test_the_view_is_the_environment(task: str, settings: dict[str, object]) -> 
 
 @pytest.fixture
 def own(monkeypatch):
-    """Register tasks for one test alone."""
     monkeypatch.setattr(TASKS, "_registered", {})
     return register
 

@@ -57,7 +57,6 @@ def test_an_observation_that_is_built_wrongly_is_found() -> None:
 
 
 def described(trained) -> dict:
-    """Return what the exports of a policy are written from."""
     from esp_cli.export.card import describe
     from esp_cli.export.program import program_of
 

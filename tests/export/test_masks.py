@@ -36,7 +36,6 @@ MASKED = {
 
 @pytest.fixture(autouse=True)
 def registered(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Register the task and the policies of this file, for this file alone."""
     monkeypatch.setattr(TASKS, "_registered", {})
     register(Fenced)
     for kind, told in MASKED.items():

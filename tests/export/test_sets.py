@@ -21,7 +21,6 @@ from tests.export.policies import drawn_policy
 
 
 def runners(program: Program, folder: Path) -> dict[str, Runner]:
-    """Write a program in all formats and run it."""
     (folder / "policy.pt2").write_bytes(torch_archive(program, "{}"))
     (folder / "policy.onnx").write_bytes(onnx_model(program, "{}"))
     (folder / "policy.py").write_bytes(numpy_source(program, "", {}))

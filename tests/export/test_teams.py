@@ -89,7 +89,6 @@ def test_what_is_not_a_number_stays_so_in_c(tmp_path: Path) -> None:
 
 @torch.no_grad()
 def both(program: Program, rows: np.ndarray) -> list[np.ndarray]:
-    """Return what the numpy and the torch export say to rows."""
     through_torch = TorchProgram(program)(torch.from_numpy(rows))[1].numpy()
     return [numpy_policy(program).outputs(rows, np.zeros((len(rows), 0)))[0], through_torch]
 

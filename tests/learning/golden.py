@@ -201,7 +201,6 @@ def on_file() -> dict[str, dict[str, str]]:
 
 
 def measure(cases: Iterable[str]) -> dict[str, str]:
-    """Return the hashes of some cases, trained in temporary folders."""
     with tempfile.TemporaryDirectory() as folder:
         return {case: train(case, Path(folder) / str(k)) for k, case in enumerate(cases)}
 

@@ -12,7 +12,6 @@ from tests.learning.golden import CASES, digest, on_file, probe, train
 
 @pytest.fixture(scope="session")
 def reachable() -> dict[str, str]:
-    """Return the weights on file that processors like this one reach."""
     weights = on_file().get(probe())
     if weights is None:
         pytest.skip("this processor, or its libraries, round otherwise than those that the weights on file come from")

@@ -17,7 +17,6 @@ MAKER = runpy.run_path(str(ROOT / "docs" / "make_api.py"))
 
 
 def complaints(held: dict[str, Any], found: dict[str, str], changelog: str) -> list[str]:
-    """Say what is wrong with the signatures on file."""
     wrong = [
         f"{name} changed"
         for name in held["signatures"].keys() | found

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
 import re
 import runpy
 import sys
@@ -13,13 +12,6 @@ import pytest
 DOCS = Path(__file__).parents[2] / "docs"
 SCRIPT = DOCS / "plain_mappo.py"
 MARK = "  # ESP"
-
-
-def test_examples_of_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    failed, tried = doctest.testfile(str(DOCS / "library.md"), module_relative=False, encoding="utf-8")
-    assert tried >= 20
-    assert failed == 0
 
 
 def test_the_script_is_as_short_as_the_page_says() -> None:

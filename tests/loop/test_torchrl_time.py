@@ -32,7 +32,6 @@ TORQUE = Continuous(layout(Field("torque", Kind.PSEUDOSCALAR)))
 
 
 def mirrored() -> Symmetry:
-    """Return the mirror symmetry of a pendulum."""
     return Symmetry(observation=SEEN, action=TORQUE, group="flip-x")
 
 

@@ -18,8 +18,6 @@ from esp_envs.registry import make
 
 
 class Scaled(Memoryless):
-    """A linear layer times a constant."""
-
     def __init__(self, rngs, inputs, outputs, gain, scale):
         super().__init__()
         self.layer, self.scale = SeedLinear(rngs, inputs, outputs, gain), scale

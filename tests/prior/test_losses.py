@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from esp_cli.networks.heads import Categorical
-from esp_cli.prior import PriorConfig, SymmetryPrior, policy_consistency_loss, value_consistency_loss
+from esp_cli.prior import PriorConfig, SymmetryPrior, policy_consistency_loss
 from esp_cli.symmetry import transform_set
 from esp_envs import make
 
@@ -37,10 +37,6 @@ def test_policy_consistency_vanishes_exactly_where_the_policy_turns_with_the_wor
     stubborn = policy_consistency_loss(head.divergence, g.pull_back(here.log()), here.log())
     # negative control: 0.75 log 16 for the two swapped probabilities
     torch.testing.assert_close(stubborn, torch.full((1, 1, 3), 0.75 * math.log(16)))
-
-
-def test_value_consistency_is_the_squared_gap():
-    assert value_consistency_loss(torch.tensor([1.0]), torch.tensor([3.0])).item() == 4.0
 
 
 @pytest.mark.parametrize(
@@ -82,11 +78,3 @@ def test_copies_and_their_share():
     assert float(prior(transforms="d4").augmented_share(1)) == 1 / 2
     assert float(prior(transforms="d4", kind="consistency").augmented_share(1)) == 0
     assert prior(kind="none").num_copies == 0
-
-
-def test_a_task_refuses_what_its_actions_cannot_carry():
-    with pytest.raises(ValueError, match="c8"):
-        SymmetryPrior(PriorConfig(transforms="c8"), SPEC)
-    continuous = make("navigation", 1, [0], {"actions": "continuous"}).spec
-    with pytest.raises(ValueError, match="all"):
-        SymmetryPrior(PriorConfig(transforms="so2", copies="all"), continuous)

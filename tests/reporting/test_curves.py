@@ -30,7 +30,6 @@ def curve(values, label="run", steps=STEPS, seeds=SEEDS, **choice) -> RunCurve:
 
 
 def gathered(curves, at=(), thresholds=()):
-    """What a report of these runs is made from."""
     return collect_runs(curves, "esp report", "greedy", at, thresholds)
 
 
@@ -45,7 +44,6 @@ def compare(curves, at, thresholds) -> dict[str, dict[int, dict]]:
 
 
 def written(folder: Path, rows: list[dict], **choice) -> RunFolder:
-    """Make a run folder whose metrics are these rows."""
     run = tiny_folder(folder, **choice)
     run.metrics_path.write_text("".join(json.dumps(row) + "\n" for row in rows))
     return run

@@ -42,7 +42,6 @@ def drawn(monkeypatch):
 
 
 def draw(curves, path, **lines):
-    """Draw one panel; returns the files."""
     picture = learning_curves([Panel("a panel", curves, **lines)], path, "return")
     return picture.png, picture.svg
 

@@ -23,7 +23,6 @@ EMPTY |= {"mode": "greedy", "rows": "panels", "episodes": 4, "config": {}, "cell
 
 
 def column(results, name, heading):
-    """Return one column of a table as texts."""
     table = TABLES[name](summarised(results))
     return [row[table.headings.index(heading)] for row in table.rows]
 

@@ -18,7 +18,6 @@ SEEDS = (0, 1, 2)
 
 
 def request(**choice: Any) -> Request:
-    """A request for tiny runs of three seeds."""
     overrides = {name: value for name, value in TINY.items() if not name.startswith("mappo.")}
     defaults = {"algorithms": ("mappo",), "steps": ((None, 200),), "seeds": SEEDS, "episodes": 4}
     return Request(**(defaults | {"overrides": overrides, "command": "esp reproduce table1 --steps 200"} | choice))
@@ -31,7 +30,6 @@ def small_study(kind: str = "table1", **choice: Any) -> Study:
 
 
 def write_run(folder: StudyFolder, cell: Cell, rows: list[list[float | None]], finals: list[float | None]) -> None:
-    """Write a finished run by hand: evaluations at 0, 100, 200 ... and a final evaluation."""
     run = folder.prepare(cell)
     lines = [
         {"step": 100 * k, "eval/return_greedy": row, "eval/return_stochastic": row, "time/elapsed_s": 10.0 * k}
@@ -43,7 +41,6 @@ def write_run(folder: StudyFolder, cell: Cell, rows: list[list[float | None]], f
 
 
 def final_evaluation(finals: list[float | None], seeds: Sequence[int] = SEEDS) -> dict[str, Any]:
-    """The smallest final evaluation that is read."""
     returns = {"mean": None, "sem": None, "ci95": None, "per_seed": finals}
     return {
         "esp_version": "0.0.1",

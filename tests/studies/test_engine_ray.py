@@ -298,7 +298,6 @@ def test_a_search_on_a_cluster_goes_on_after_a_stop_and_scores_as_on_this_machin
     asked = tuning(priors=("esp",), budget=3, steps=STEPS // 3)
 
     def searched(path: Path, engine: Engine) -> Outcome:
-        """Search; stop at the first checkpoint, and go on."""
         first = path / "trials" / "esp-000"
         for until in (lambda _: not any(first.glob("checkpoints/step-*.safetensors")), lambda _: True):
             assert not (first / "policy.safetensors").exists()

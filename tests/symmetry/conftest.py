@@ -15,8 +15,6 @@ MakeSpec = Callable[..., TaskSpec]
 
 @pytest.fixture(scope="session")
 def make_spec() -> MakeSpec:
-    """Return a factory of task specs with all field kinds in observation and state."""
-
     def make(
         num_agents: int = 3, action=FOUR_DIRECTIONS, symmetry: str = "o2*agents", joint_state: bool = False
     ) -> TaskSpec:
@@ -51,5 +49,4 @@ def make_spec() -> MakeSpec:
 
 @pytest.fixture
 def generators() -> list[torch.Generator]:
-    """Return the generators of three seeds."""
     return [torch.Generator().manual_seed(seed) for seed in (3, 4, 5)]

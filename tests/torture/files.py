@@ -77,8 +77,6 @@ class Kind:
 
 
 class Files(Part):
-    """Batches of spoilt files."""
-
     def __init__(self, scratch: Path, seed: int) -> None:
         self.scratch, self.seed = scratch / "files", seed
         _make_sound_files(self.scratch)
@@ -237,7 +235,6 @@ def _agrees(text: Any, taken: Any) -> bool:
 
 
 def _document(kind: DocumentFormat, path: Path, taken: Any) -> str | None:
-    """Say whether a document was taken for something else than it says."""
     return None if _agrees(kind.read(path), taken) else "something else was taken than the file says"
 
 

@@ -58,8 +58,6 @@ WRONG_NUMBERS: tuple[Callable[[Tensor], Any], ...] = (*WRONG[2:4], *WRONG[7:11],
 
 
 class Hosts(Part):
-    """Batches of calls."""
-
     def __init__(self, scratch: Path, seed: int) -> None:
         self.seed, self.kinds = seed, []
         for seen, action, group in itertools.product(SEEN, ACTIONS, GROUPS):
@@ -67,7 +65,6 @@ class Hosts(Part):
             self.kinds.append((f"{seen.summary} {group}", symmetry))
 
     def run(self, number: int) -> str | None:
-        """Try a batch."""
         rng = random.Random(f"{self.seed} {number}")
         torch.manual_seed(rng.getrandbits(32))
         for _ in range(BATCH):

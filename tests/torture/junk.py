@@ -18,7 +18,6 @@ TEXTS = (b"NaN", b"Infinity", b"-Infinity", b"1e999", b"null", b"true", b"[" * 2
 
 
 def spoil_bytes(content: bytes, rng: random.Random) -> bytes:
-    """Return bytes with one to three kinds of damage."""
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         size = len(content)
         a, b = sorted((rng.randint(0, size), rng.randint(0, size)))

@@ -50,8 +50,6 @@ VALUES = (
 
 
 class Lines(Part):
-    """Batches of wrong command lines."""
-
     def __init__(self, scratch: Path, seed: int) -> None:
         self.scratch, self.seed = scratch / "lines", seed
         self.scratch.mkdir()
@@ -65,7 +63,6 @@ class Lines(Part):
         train._train = lambda *_: None  # a run that can begin is not a wrong line
 
     def run(self, number: int) -> str | None:
-        """Try a batch."""
         rng = random.Random(f"{self.seed} {number}")
         for _ in range(BATCH):
             with _inside(self.scratch):
@@ -120,7 +117,6 @@ class Lines(Part):
         return [name, *words, f"{option.opts[0]}={bad}"]
 
     def _setting_line(self, rng: random.Random) -> list[str]:
-        """Return a training command with one bad setting."""
         task, algorithm, network = rng.choice(_tasks()), rng.choice(list(ALGORITHMS)), rng.choice(list(NETWORKS))
         words = ["train", "--task", task, "--algo", algorithm, "--network", network, "--steps", "100", "--out", "out"]
         section = rng.choice(["task", algorithm, "network", "prior", "evaluation"])
@@ -144,7 +140,6 @@ def _settings() -> Iterator[tuple[str, type[BaseModel]]]:
 
 
 def _bad_setting(model: type[BaseModel], name: str, rng: random.Random) -> str:
-    """Return a value that a setting cannot have."""
     annotation = model.model_fields[name].annotation if name in model.model_fields else str
     kinds = {annotation, *typing.get_args(annotation)}
     sound = {"null"} if NoneType in kinds else {"{}", '{"a":1}'} if typing.get_origin(annotation) is dict else set()
@@ -158,7 +153,6 @@ def _bad_setting(model: type[BaseModel], name: str, rng: random.Random) -> str:
 
 
 def _bad_value(option: Any, rng: random.Random) -> str | None:
-    """Return a value that an option cannot have; None where any text is one."""
     kind = option.type_descriptor.annotation
     if option.name in _NUMBERS:
         return rng.choice(_NUMBERS[option.name])

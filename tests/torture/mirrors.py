@@ -59,7 +59,6 @@ class Mirrors(Part):
         self.counts: dict[tuple[str, str], int] = {}
 
     def run(self, number: int) -> str | None:
-        """Try a robot with one element."""
         rng, name = random.Random(f"{self.seed} {number}"), ROBOTS[number % len(ROBOTS)]
         frame, body = self._robot(name)
         element, numbers = rng.choice(body.elements), _numbers(body, rng)
@@ -101,7 +100,6 @@ def _numbers(body: Body, rng: random.Random) -> Numbers:
 
 
 def _wrong(seen: np.ndarray, acted: np.ndarray, body: Body, numbers: Numbers) -> list[tuple[str, str, str]]:
-    """Return what the audit finds wrong."""
     L, K = torch.tensor(seen).float(), torch.tensor(acted).float()
 
     def function(obs: torch.Tensor, actions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -94,8 +94,6 @@ def numbers(body):
 
 
 class Models(Part):
-    """Batches of hostile models."""
-
     def __init__(self, scratch: Path, seed: int) -> None:
         self.scratch, self.seed = scratch / "models", seed
         self.folder = self.scratch / "robot"
@@ -125,7 +123,6 @@ class Models(Part):
         )  # read, written, opened, moved, made, removed
 
     def run(self, number: int) -> str | None:
-        """Try a batch."""
         rng = random.Random(f"{self.seed} {number}")
         for index in range(BATCH):
             content, self.done = self._model(rng), self.done + 1

@@ -19,7 +19,6 @@ class Part:
     """Kills that took effect, files or lines since they were counted."""
 
     def run(self, number: int) -> str | None:
-        """Return what is wrong, or None."""
         raise NotImplementedError
 
     def count(self) -> int:
@@ -57,7 +56,6 @@ class Record:
 
     @classmethod
     def open(cls, path: Path | None, seed: int) -> Record:
-        """Go on with a record, or begin one."""
         if path is None or not path.is_file():
             return cls(seed, path)
         found = json.loads(path.read_text())
@@ -85,12 +83,10 @@ class Record:
         self.save()
 
     def save(self) -> None:
-        """Write the record, if it has a file."""
         if self.path is not None:
             content = {key: value for key, value in asdict(self).items() if key != "path"}
             replace_file(self.path, json.dumps(content, indent=1).encode())
 
     def summary(self) -> str:
-        """Return one line."""
         parts = [f"{count} {name} in {self.seconds[name]:.0f} s" for name, count in self.counts.items()]
         return f"seed {self.seed}: {', '.join(parts)}; {len(self.findings)} findings"

@@ -69,7 +69,6 @@ def _choices() -> Iterator[Choice]:
 
 
 def run_job(path: Path, config: RunConfig) -> None:
-    """Train a run, or go on with it, as `esp train` does."""
     trainer.CHECKPOINT_SECONDS = trainer.CHECKPOINT_SPACING = 0
     if not (path / "config.json").exists():
         RunFolder.create(path, config.model_dump(mode="json"))

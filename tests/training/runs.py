@@ -21,5 +21,4 @@ def tiny_config(steps=300, seeds=(0, 1), task="navigation", **overrides) -> RunC
 
 
 def tiny_folder(path, **choice) -> RunFolder:
-    """A new run folder for a tiny run."""
     return RunFolder.create(path, tiny_config(**choice).model_dump(mode="json"))

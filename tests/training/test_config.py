@@ -66,6 +66,18 @@ def test_what_a_preset_sets_for_its_network_is_left_out_for_another_that_does_no
     [
         ("navigation", "mappo", {}, {"mappo.truncation", "task.local_ratio"}),
         ("navigation", "mappo", {"task.convention": "pettingzoo"}, {"mappo.truncation"}),
+        (
+            "predator-prey",
+            "mappo",
+            {"network.name": "equivariant", "network.relaxation": "weights"},
+            {"mappo.truncation", "network.relaxation"},
+        ),
+        (
+            "predator-prey",
+            "mappo",
+            {"network.name": "equivariant", "network.relaxation": "weights", "network.relax": 1},
+            {"mappo.truncation"},
+        ),
         ("predator-prey", "mappo", {}, {"mappo.truncation"}),
         ("predator-prey", "mappo", {"network.name": "gru"}, set()),
         ("wildlife", "mappo", {}, {"mappo.truncation", "mappo.critic_activation"}),

@@ -26,7 +26,6 @@ def trained(tmp_path_factory) -> Trainer:
 
 @pytest.fixture
 def folder(trained, tmp_path) -> RunFolder:
-    """A copy of the run, to be changed."""
     return RunFolder.open(shutil.copytree(trained.folder.path, tmp_path / "run"))
 
 

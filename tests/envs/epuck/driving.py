@@ -30,7 +30,6 @@ def at_posts(arena: Arena, worlds: int, rng: np.random.Generator) -> Array:
 
 
 def engine(name: str, arena: Arena, pose: Array, **others: Array) -> Physics:
-    """Return the worlds `bodies` describes, in the engine `name`."""
     physics = make_physics(name, arena, len(pose), PERIOD_S)
     physics.place(**bodies(arena, pose, **others))
     return physics
