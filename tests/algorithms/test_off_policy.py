@@ -35,14 +35,6 @@ def test_each_mean_of_the_prior_changes_the_run(algorithm, kind, replay):
 
 
 @both
-@pytest.mark.parametrize(("network", "kind"), [("mlp", "esp"), ("gru", "none")])
-def test_same_seed_same_run(algorithm, network, kind):
-    first, _ = after(algorithm, network__name=network, prior__kind=kind)
-    second, _ = after(algorithm, network__name=network, prior__kind=kind)
-    assert equal(first, second)
-
-
-@both
 @pytest.mark.parametrize(
     "choice", [{"prior__kind": "none"}, {"prior__replay": "stored"}, {"network__name": "gru"}, {}], ids=str
 )

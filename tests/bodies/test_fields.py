@@ -11,13 +11,11 @@ import torch
 
 from esp_cli import Body, Continuous, Field, Symmetry, layout
 from esp_cli.bodies import ATTITUDE_6D, AXIAL_3D, PLANAR_COMMAND, QUATERNION, QUATERNION_XYZW, VECTOR_3D, grid
-from esp_cli.symmetry.plane import PlaneElement, mirror, rotation
 from esp_envs.errors import UserError
 from tests.bodies.models import QUADRUPED, biped
 
 JOINTS = [f"{leg}_{part}" for part in ("HAA", "HFE", "KFE") for leg in ("LF", "LH", "RF", "RH")]
 """ANYmal's, in the order of Isaac Sim."""
-FEET = ["LF", "LH", "RF", "RH"]
 
 
 def anymal() -> Body:
@@ -202,9 +200,3 @@ def test_whole_histories_are_mirrored_and_a_wrong_mirror_shows():
     assert symmetry.policy_loss(policy, obs) < 1e-10
     kept = obs[:3, ..., joints].sum(0)
     assert symmetry.policy_loss(lambda rows: kept + rows[..., joints].cumsum(0), obs[3:]) > 0.1
-
-
-def test_elements_keep_their_planar_names():
-    assert PlaneElement.of(mirror(0)) in anymal().elements
-    assert PlaneElement.of(rotation(180)) in anymal().elements
-    assert anymal().group == "d2"

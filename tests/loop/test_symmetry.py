@@ -151,16 +151,6 @@ def test_actions_may_come_as_a_column_or_one_hot() -> None:
     assert torch.equal(symmetry.augment(obs, one_hot)[1].argmax(-1), plain)
 
 
-def test_drawn_elements_follow_the_seed_and_never_stand_still() -> None:
-    def drawn(seed: int) -> list[str]:
-        symmetry = Symmetry(observation=SEEN, action=MOVES, seed=seed)
-        return [symmetry.transforms(torch.zeros(()))[0].elements[0].name for _ in range(50)]
-
-    assert drawn(1) == drawn(1) != drawn(2)
-    assert len(set(drawn(1))) == 7
-    assert "identity" not in drawn(1)
-
-
 def test_a_policy_that_turns_with_the_scene_has_no_loss() -> None:
     def heading(obs: Tensor) -> Tensor:
         x, y = obs[..., 0], obs[..., 1]
@@ -244,14 +234,6 @@ def test_known_answers_in_another_shape_are_refused_instead_of_broadcast() -> No
         symmetry.value_loss(value, obs=obs, here=value(obs).squeeze(-1))
     with pytest.raises(ValueError, match=r"value has shape \[6, 4\] for the moved data, but \[6, 1\]"):
         symmetry.action_value_loss(lambda o: o[..., [0, 0, 1, 1]], obs, here=value(obs))
-
-
-def test_gradients_reach_the_data_and_the_networks() -> None:
-    net, obs = nn.Linear(3, 4), random(5, 3).requires_grad_()
-    quarter().policy_loss(net, obs).backward()
-    assert net.weight.grad is not None
-    assert net.weight.grad.abs().sum() > 0
-    assert quarter().augment(obs, torch.zeros(5, dtype=torch.int64))[0].requires_grad
 
 
 def test_a_recurrent_policy_is_compared_over_its_whole_history() -> None:
@@ -393,14 +375,6 @@ def test_a_check_says_which_shape_is_needed_and_takes_other_precisions() -> None
         symmetry.check(team)
     with pytest.raises(ValueError, match="'obs' of the transitions has shape"):
         symmetry.check(Transitions(*(part[:, 0] for part in (data.obs, data.action, data.reward, data.next_obs))))
-
-
-def test_a_group_that_the_actions_cannot_carry_is_refused() -> None:
-    with pytest.raises(ValueError, match="c8 cannot act on the task: action 'right' turned by 45 degrees is no action"):
-        Symmetry(observation=SEEN, action=MOVES, group="c8")
-    assert Symmetry(observation=SEEN, action=FORCE, group="c8")
-    with pytest.raises(ValueError, match="copies='all' needs a finite group, but 'so2' is infinite"):
-        Symmetry(observation=SEEN, action=FORCE, group="so2", copies="all")
 
 
 IMPORTED = """

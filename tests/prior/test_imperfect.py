@@ -11,13 +11,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.checking.measured import prepared
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.prior import PriorConfig, SymmetryPrior
 from esp_cli.run import Run
 from esp_cli.symmetry import build_transform, mirror, parse_elements, rotation, transform_set
-from esp_cli.training.build import build_environment, build_learner
+from esp_cli.training.build import build_environment
 from esp_cli.training.checkpoint import read_policy
 from esp_cli.training.config import RunConfig, resolve_config
 from esp_cli.training.run_folder import RunFolder
@@ -275,14 +274,6 @@ def test_without_a_prior_there_is_no_compass() -> None:
     for overrides in ({"prior.kind": "none"}, {"prior.kind": "consistency", "prior.consistency_coef": 0}):
         config = resolve_config("navigation", overrides={"prior.compass": 1.0, **overrides})
         assert build_environment(config, 1, "x").spec == make("navigation", 1, [0]).spec
-
-
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_every_learner_sees_the_compass(algorithm: str) -> None:
-    config = resolve_config("navigation", algorithm, overrides={"prior.compass": 1.0})
-    learner = build_learner(config)
-    assert learner.spec.observation.width == 18
-    assert learner.spec == build_environment(config, 1, "x").spec
 
 
 @pytest.mark.parametrize("trust", ["measured", "gate"])

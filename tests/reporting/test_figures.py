@@ -72,12 +72,6 @@ def test_figures_are_the_same_bytes_every_time_and_carry_no_date(tmp_path, draw)
     assert "dc:date" not in text
 
 
-@pytest.mark.parametrize("draw", [draw_curves, draw_dots])
-def test_other_numbers_are_another_figure(tmp_path, draw):
-    other = draw(tmp_path / "b", {"paper": -130.0})
-    assert draw(tmp_path / "a")[1].read_bytes() != other[1].read_bytes()
-
-
 def test_the_settings_of_the_caller_are_left_alone(tmp_path):
     before = dict(mpl.rcParams)
     draw_curves(tmp_path / "a")

@@ -178,15 +178,6 @@ def test_an_evaluation_beside_which_no_trained_policy_lies_does_not_count(tmp_pa
     assert collect_study(folder).results.cells[0].status == "unfinished"
 
 
-def test_the_paper_stands_below_ours(tmp_path):
-    study = small_study(steps=((None, 500_000),))
-    found = collect_study(write_study(tmp_path / "s", study, {"MAPPO": PLAIN, "MAPPO-ESP": ESP})).results
-    assert returns_table(found).rows == (
-        ("navigation, 500k", "ours", "-150.00 ± 5.77", "-130.00 ± 5.77"),
-        ("", "paper", "-132.65 ± 2.89", "-122.25 ± 1.62"),
-    )
-
-
 def test_a_results_file_holds_configuration_version_and_every_seed(results, tmp_path):
     file = tmp_path / "results.json"
     file.write_text(json.dumps(results.document()))
