@@ -1,7 +1,5 @@
 """What every test shares: one thread per process, no display, and property tests without deadlines."""
 
-from __future__ import annotations
-
 import os
 import resource
 from collections.abc import Callable, Iterator

@@ -4,8 +4,6 @@
 `Fault("write", 1, "ENOSPC")` fails in the middle of the first write as a full disk does.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 import signal

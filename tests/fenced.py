@@ -1,7 +1,5 @@
 """A task whose actions are masked: agents may not leave a square. It raises where an agent does."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

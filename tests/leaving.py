@@ -1,7 +1,5 @@
 """A task whose agents end one by one: who reaches the right half of the line has arrived, and acts no more."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """The tasks of docs/own-tasks.md and docs/adapters.md, taken from the pages as a reader would."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

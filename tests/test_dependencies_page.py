@@ -1,7 +1,5 @@
 """docs/dependencies.md says what constraints.txt says, for every package that a user installs."""
 
-from __future__ import annotations
-
 import re
 from datetime import date
 from pathlib import Path

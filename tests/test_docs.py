@@ -1,7 +1,5 @@
 """The documentation keeps its word: links lead somewhere, names of code exist, every `esp` command line parses."""
 
-from __future__ import annotations
-
 import ast
 import re
 import shlex

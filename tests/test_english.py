@@ -1,7 +1,5 @@
 """The English of the documentation: words that are not used, and sentences that can be read at once."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The examples of the pages give what the pages say."""
 
-from __future__ import annotations
-
 import doctest
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The script that fills the pages: tables from results files and nothing else, and verdicts on broken symmetry."""
 
-from __future__ import annotations
-
 import json
 import os
 import runpy

@@ -1,7 +1,5 @@
 """The README and what it shows: short, its snippet runs, and every number is that of a file."""
 
-from __future__ import annotations
-
 import json
 import re
 import runpy

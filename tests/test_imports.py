@@ -6,8 +6,6 @@ reporting -> studies -> policies; all that knows tasks by their contract alone -
 The environment classes behind the contract (`esp_envs.spec` and `esp_envs.base`) are known to training and above only.
 """
 
-from __future__ import annotations
-
 import ast
 import re
 import runpy

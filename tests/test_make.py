@@ -1,7 +1,5 @@
 """The Makefile's recipes run in a path with spaces and umlauts, and as a user without rights."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

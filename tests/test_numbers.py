@@ -6,8 +6,6 @@ paragraph links. What stands before the first `##` sums up: it may draw on the f
 Pages of rules and settings may also state a constant of the source code. Code counts as no statement.
 """
 
-from __future__ import annotations
-
 import ast
 import json
 import random

@@ -1,7 +1,5 @@
 """Every table of results in the documentation is what its committed file gives."""
 
-from __future__ import annotations
-
 import re
 import runpy
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What compares the wheel with the checkout finds what is missing and what is too much."""
 
-from __future__ import annotations
-
 import zipfile
 from pathlib import Path
 

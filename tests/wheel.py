@@ -3,8 +3,6 @@
 python -m tests.wheel dist/esp_marl-*.whl
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import zipfile

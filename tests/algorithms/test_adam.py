@@ -1,7 +1,5 @@
 """One buffer for the parameters of all seeds: views, clipping and Adam's steps against torch's own."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Agents that end one by one: no loss, no value and no statistics behind an agent's own end."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Masked actions: probability 0, gradient 0, never in a maximum, and moved by a transform with the actions."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Each loss against autograd through the same loss in the terms of the paper, and against numbers by hand."""
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path

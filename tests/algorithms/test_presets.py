@@ -1,7 +1,5 @@
 """The preset `fast` is `default` with the changes that its table states; `paper` goes with the paper's tasks."""
 
-from __future__ import annotations
-
 import pytest
 
 from esp_cli.algorithms.presets import FAST, PRESETS, SETS, preset_layers

@@ -1,7 +1,5 @@
 """Offsets and scales of the reward: what a learner makes of rewards a + b r, against what it makes of r."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Small robots, each an MJCF text: what their mirrors do is worked out by hand beside them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 

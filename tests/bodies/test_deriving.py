@@ -1,7 +1,5 @@
 """Mirrors derived from models: by hand on small robots, and every planted mistake is found."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from fractions import Fraction

@@ -1,7 +1,5 @@
 """Files for the loops of others, and audits of mirrors that others wrote: each planted mistake is named."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import runpy

@@ -1,7 +1,5 @@
 """Numbers of robots in layouts: by hand, as groups ask, in any simulator's order, and in a loop with histories."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import mujoco

@@ -1,7 +1,5 @@
 """Tasks of Gymnasium and MaMuJoCo: what their models say, by hand, and a wrong sign that paired states refuse."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

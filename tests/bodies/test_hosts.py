@@ -1,7 +1,5 @@
 """Emitted mirrors inside of the real Stable-Baselines3 and skrl, by the lines that the page of legged robots gives."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Model files of strangers: nothing outside their folder is read, and what is wrong ends in one sentence."""
 
-from __future__ import annotations
-
 import os
 
 import pytest

@@ -1,7 +1,5 @@
 """How far a policy is from turning with its body: right, wrong and hostile policies."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The quadruped: its model, what it feels, when it falls, and what its commands pay, by hand."""
 
-from __future__ import annotations
-
 import mujoco
 import numpy as np
 import pytest

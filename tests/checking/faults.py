@@ -1,7 +1,5 @@
 """Tasks with a fault of their own: what a task shows, pays or does is not as its spec says."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 

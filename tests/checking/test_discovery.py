@@ -1,7 +1,5 @@
 """Symmetries that nobody declared: found in tasks and in logs, and none found where there is none."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """The check of symmetry finds fifty seeded faults and accuses none of fifty clean tasks."""
 
-from __future__ import annotations
-
 import pytest
 
 from esp_cli.checking import check_symmetry, paired

@@ -1,7 +1,5 @@
 """What agents of other roles do, and what chance does, decides no verdict: by hand, and with laws that are broken."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """How symmetric a policy is, along its own episodes, and that a check of many elements leaves none of them out."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Symmetry from transitions alone, for tasks that cannot be set to a state and for data of others."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

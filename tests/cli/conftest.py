@@ -1,7 +1,5 @@
 """One tiny run that the tests of the commands share, and copies of it to break."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Commands run in this process, and policies that a user might hand over by mistake or by malice."""
 
-from __future__ import annotations
-
 import json
 import pickle
 import shutil

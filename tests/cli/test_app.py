@@ -1,7 +1,5 @@
 """The application: lazy commands, help without torch, and one exit code per kind of failure."""
 
-from __future__ import annotations
-
 import errno
 import os
 import signal

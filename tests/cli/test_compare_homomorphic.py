@@ -1,7 +1,5 @@
 """`esp compare-homomorphic`: trains, goes on, tabulates; wildlife with every network from the command line."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

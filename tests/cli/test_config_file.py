@@ -1,7 +1,5 @@
 """`esp train` with `--config` and `--print-config`: what files say, and what wins."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """What the console prints, and how it writes numbers."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

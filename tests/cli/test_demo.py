@@ -1,7 +1,5 @@
 """`esp demo`: two runs side by side, their curves, a film of both, and what the numbers say."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """`esp eval`: the documented result, and one sentence for whatever is no policy."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """`esp export` and `esp policies`: what is asked for is written, and mistakes are told in a sentence."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

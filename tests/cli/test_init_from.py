@@ -1,7 +1,5 @@
 """`esp train --init-from`, and `--config` of runs that started from a policy: which weights, and what does not fit."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

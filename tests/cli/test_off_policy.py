@@ -1,7 +1,5 @@
 """MADDPG and QMIX from the command line: trained, resumed, judged, drawn and compared like MAPPO."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

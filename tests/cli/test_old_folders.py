@@ -1,7 +1,5 @@
 """Folders and files that version 0.1.0 wrote load, resume, evaluate, report and export."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

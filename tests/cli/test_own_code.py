@@ -1,7 +1,5 @@
 """Code of the user that fails: one sentence that names the line, exit code 2, and nothing of the run lost."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

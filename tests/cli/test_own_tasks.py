@@ -1,7 +1,5 @@
 """A task of one's own through the application, from training to a study, in processes that know nothing of it."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

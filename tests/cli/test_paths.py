@@ -1,7 +1,5 @@
 """Places that nothing can be written to: one sentence, the documented exit code, and nothing destroyed."""
 
-from __future__ import annotations
-
 import stat
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`esp render`: films and pictures of the right length, size and speed; one sentence for whatever cannot be drawn."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`esp report`: runs side by side."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

@@ -1,7 +1,5 @@
 """`esp reproduce symmetry`: costs, mistakes, and a small benchmark that survives being killed."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

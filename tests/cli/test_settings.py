@@ -1,7 +1,5 @@
 """`esp settings`: what it lists is what the models say, and what --set takes."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """`esp ablate` and `esp reproduce`: plans, costs, and studies that survive being killed."""
 
-from __future__ import annotations
-
 import json
 import shlex
 import sys

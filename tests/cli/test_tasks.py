@@ -1,7 +1,5 @@
 """`esp tasks`: the tasks with their symmetries, and their cards."""
 
-from __future__ import annotations
-
 import json
 import os
 import runpy

@@ -1,7 +1,5 @@
 """What a person sees at 80 columns: tables that cut no name, and a progress line that keeps what matters."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import pty

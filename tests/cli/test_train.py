@@ -1,7 +1,5 @@
 """`esp train`: what the options mean, what is refused before a folder is made, and how runs stop and go on."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

@@ -1,7 +1,5 @@
 """`esp tune`: costs, mistakes, and one small search from the command to a preset."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

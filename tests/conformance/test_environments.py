@@ -3,8 +3,6 @@
 A new task adds its settings to SETTINGS; the registry test below complains if it does not.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Scenes and episodes that the tests of pictures and films draw."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from esp_cli.drawing.recording import Episode

@@ -1,7 +1,5 @@
 """Still pictures: paths where they went, who covers what when, and the last steps side by side."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from io import BytesIO
 

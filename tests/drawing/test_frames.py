@@ -1,7 +1,5 @@
 """Frames: caption, axes and legend stand around the picture, which stays as it is."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

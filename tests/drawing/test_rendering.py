@@ -1,7 +1,5 @@
 """Films and pictures: every step of every episode of the chosen seed, in real time, drawn without a display."""
 
-from __future__ import annotations
-
 import contextlib
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A task with two roles on a line, whose numbers are worked out by hand."""
 
-from __future__ import annotations
-
 import torch
 
 from esp_envs import BatchedTask, Field, Items, Kind, layout

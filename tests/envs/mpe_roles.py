@@ -2,8 +2,6 @@
 
 # ruff: noqa: RUF012  (as users write a task)
 
-from __future__ import annotations
-
 from esp_envs import Discrete, Field, Items, Kind, layout
 from esp_envs.adapters.pettingzoo import ParallelTask
 from esp_envs.spec import discrete_moves

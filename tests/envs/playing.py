@@ -1,7 +1,5 @@
 """Play whole episodes with a heuristic or at random."""
 
-from __future__ import annotations
-
 import torch
 
 from esp_envs import Environment

@@ -1,7 +1,5 @@
 """Action masks and agents that end one by one, read from PettingZoo and Gymnasium environments."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Tasks derived from `BatchedTask`: ends, masks, memory, and what optional methods answer where a task lacks them."""
 
-from __future__ import annotations
-
 import re
 import runpy
 import time

@@ -1,7 +1,5 @@
 """Settings that break a task's symmetry: what they do, which group is left, and that 0 changes nothing."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

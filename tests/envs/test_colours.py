@@ -1,7 +1,5 @@
 """Colours that people with any common colour blindness tell apart, measured as CIE76 distances."""
 
-from __future__ import annotations
-
 from itertools import combinations
 
 import numpy as np

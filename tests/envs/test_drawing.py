@@ -1,7 +1,5 @@
 """Pictures: colours where bodies are, y upwards, trails that fade, and a real format."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

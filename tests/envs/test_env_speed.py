@@ -1,7 +1,5 @@
 """The speed scripts run, print their tables and write JSON."""
 
-from __future__ import annotations
-
 import importlib
 import itertools
 import json

@@ -1,7 +1,5 @@
 """Small environments with one fault each, and what is right: it runs, is refused in a sentence, or `check` names it."""
 
-from __future__ import annotations
-
 import re
 import sys
 import time

@@ -1,7 +1,5 @@
 """Tasks with many agents: pairs by broadcasting, neighbours alone, one density, and an assignment that scales."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from operator import methodcaller

@@ -5,8 +5,6 @@ MPE, which moves velocities first: for it mpe2's integrator is replaced by the o
 from the formula in the documentation.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

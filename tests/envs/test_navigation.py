@@ -1,7 +1,5 @@
 """Navigation: reward, metrics and start by hand, and the anchors that its numbers are read against."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Simulators of others are put into states, so that checks pair them; others are judged by transitions."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

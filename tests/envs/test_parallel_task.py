@@ -1,7 +1,5 @@
 """PettingZoo and Gymnasium environments as tasks: a small one of our own, and the real packages."""
 
-from __future__ import annotations
-
 import gc
 import os
 import signal

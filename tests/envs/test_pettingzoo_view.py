@@ -1,7 +1,5 @@
 """The PettingZoo view passes PettingZoo's own tests and says the same as the batched environment."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 

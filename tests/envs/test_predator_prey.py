@@ -1,7 +1,5 @@
 """Predator-prey: rewards by hand, who drives the prey, and the anchors that its numbers are read against."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -2,8 +2,6 @@
 
 # ruff: noqa: RUF012  (as users write a task)
 
-from __future__ import annotations
-
 import json
 import threading
 from pathlib import Path

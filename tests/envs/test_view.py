@@ -1,7 +1,5 @@
 """The view in space: bodies are where the camera's geometry says, and what draws them is found or named as missing."""
 
-from __future__ import annotations
-
 import importlib.util
 import math
 import os

@@ -1,7 +1,5 @@
 """Wildlife monitoring against its rules in plain Python, and by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """The rules of wildlife monitoring in plain Python, one world and one body after the other."""
 
-from __future__ import annotations
-
 import numpy as np
 
 MOVES = [(0, 0), (0, 1), (1, 0), (0, -1), (-1, 0)]  # rest, up, right, down, left

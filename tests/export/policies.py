@@ -1,7 +1,5 @@
 """Policies with drawn weights, of every network and head, for the tests of what leaves the application."""
 
-from __future__ import annotations
-
 import runpy
 from pathlib import Path
 from types import SimpleNamespace

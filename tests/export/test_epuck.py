@@ -1,7 +1,5 @@
 """What surrounds an exported policy on an e-puck: observations from poses and safety stops."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The example script of the documentation runs, and its policy gets somewhere."""
 
-from __future__ import annotations
-
 import re
 import runpy
 from pathlib import Path

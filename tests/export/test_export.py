@@ -1,7 +1,5 @@
 """Every export does what the policy does, on thousands of observations; one that does not is found."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

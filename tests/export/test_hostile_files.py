@@ -4,8 +4,6 @@ Two floods: files whose bytes were spoilt at random (the checksum or the structu
 somebody wrote on purpose, with right checksums around a hostile description or hostile tensors.
 """
 
-from __future__ import annotations
-
 import copy
 import json
 import pickle

@@ -1,7 +1,5 @@
 """Exports of policies whose task says which actions are allowed."""
 
-from __future__ import annotations
-
 import json
 import re
 import runpy

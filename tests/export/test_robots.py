@@ -1,7 +1,5 @@
 """The controllers for e-pucks drive simulated ones: a mocked robot interface stands in front of MuJoCo."""
 
-from __future__ import annotations
-
 import importlib
 import math
 import shutil

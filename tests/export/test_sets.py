@@ -1,7 +1,5 @@
 """Policies over sets leave the application for any number of things: layers by hand, other numbers, refusals."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Policies whose agents exchange messages leave the application whole: layers by hand, costs, who is near, refusals."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 from pathlib import Path

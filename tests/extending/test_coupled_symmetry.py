@@ -1,7 +1,5 @@
 """A task whose mirror exchanges agents: declared as one element, checked, refused in parts, trained with."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """What the pages on extending add works as they say: their code is run here, then used through the application."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """The larger example of the page on algorithms, docs/masac.py: soft actor-critic, used as a file of a user's own."""
 
-from __future__ import annotations
-
 import math
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """JSON documents: what is written is read again, and anything else ends in one sentence."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,7 +1,5 @@
 """Opening and holding: the program's own files are regular ones, never what somebody planted in their place."""
 
-from __future__ import annotations
-
 import os
 import signal
 from pathlib import Path

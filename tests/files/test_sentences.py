@@ -1,7 +1,5 @@
 """What sentences say: of failures of the file system, and of a name near one that nobody knows."""
 
-from __future__ import annotations
-
 import errno
 import os
 

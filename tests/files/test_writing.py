@@ -1,7 +1,5 @@
 """Writing: whole or not at all; a user's link is followed, a device written through, a planted link replaced."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

@@ -13,8 +13,6 @@ checkout first on the path:
 This module therefore uses nothing of the project but its command line and the tensors of a final checkpoint.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """A task whose best policy is known, true to the symmetries of the square, and one that is false to them."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Small runs end with the weights on file, bit for bit: a change that moves results has to say so."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """MAPPO on tasks whose best policy is known: it is found, sooner with a true symmetry, and not with a false one."""
 
-from __future__ import annotations
-
 from operator import methodcaller
 
 import pytest

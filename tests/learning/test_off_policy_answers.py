@@ -1,7 +1,5 @@
 """MADDPG and QMIX on the tasks whose best policy is known: found, sooner with a true symmetry, not with a false one."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """The public API is documented, its page holds all of it, and its signatures change with the changelog."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import runpy

@@ -1,7 +1,5 @@
 """The examples of docs/library.md give what the page says, and the single-file MAPPO runs with and without prior."""
 
-from __future__ import annotations
-
 import re
 import runpy
 import sys

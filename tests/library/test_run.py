@@ -1,7 +1,5 @@
 """The application as functions: the same numbers as the commands, metrics as arrays, stopping and going on."""
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Divergences of turned distributions against densities, by hand and by sampling."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """The facade by hand-worked numbers: copies, losses, and what it refuses, each with a control that must differ."""
 
-from __future__ import annotations
-
 import math
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Comparing the gradients of two ways to compute the same."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

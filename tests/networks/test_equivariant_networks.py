@@ -1,7 +1,5 @@
 """Networks that commute with a group: in every layer, with any weights, after training; and plain ones do not."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """A policy whose weights know no number of agents acts with any: evaluated, drawn, loaded and trained on."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Bundled policies: every one does what its manifest says, and is found by name."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

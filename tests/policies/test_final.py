@@ -1,7 +1,5 @@
 """The final evaluation of a policy: numbers by hand, anchors, and batches that depend on seeds alone."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

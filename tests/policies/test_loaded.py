@@ -1,7 +1,5 @@
 """Policies for other programs: numpy in and out, shape errors in a sentence, memory in the caller's hands."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Statistics over seeds against numbers worked out by hand."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

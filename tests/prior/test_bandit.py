@@ -1,7 +1,5 @@
 """The bandit that chooses an element by the returns that follow it."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

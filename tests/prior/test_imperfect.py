@@ -1,7 +1,5 @@
 """A prior that fades, and the compass under which every problem is exactly symmetric."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

@@ -1,7 +1,5 @@
 """The answer of a report: sentences that are made from the numbers."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The study of broken symmetry: what it runs, and what its report shows."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

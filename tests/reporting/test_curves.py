@@ -1,7 +1,5 @@
 """Runs side by side, against metrics written by hand and numbers worked out by hand."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Figures: both files, the same bytes every time, what they show, and what a page shows beside the pointer."""
 
-from __future__ import annotations
-
 import math
 from collections import namedtuple
 from xml.etree import ElementTree

@@ -1,7 +1,5 @@
 """The page of a report: self-contained, escaped, and rendered by a headless Chromium where there is one."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 from html.parser import HTMLParser

@@ -1,7 +1,5 @@
 """Results and tables of a study whose runs were written by hand."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Small studies for the tests: planned as the commands plan them, their runs written by hand or by a stand-in."""
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Sequence

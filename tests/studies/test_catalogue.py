@@ -1,7 +1,5 @@
 """The studies as lists of runs: what the paper's figures and tables hold, and what a user may change."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

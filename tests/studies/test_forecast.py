@@ -1,7 +1,5 @@
 """What is left of a study: only what is not finished is measured, sums are those of the runs, nothing is written."""
 
-from __future__ import annotations
-
 import threading
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The scheduler, over a stand-in that does to run folders what training does."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Study folders: plain files, gone on with, extended, and never written over."""
 
-from __future__ import annotations
-
 import json
 import sys
 

@@ -1,7 +1,5 @@
 """The benchmark of symmetry: its protocol, its methods and tasks, and what it refuses."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

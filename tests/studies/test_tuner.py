@@ -1,7 +1,5 @@
 """The search of settings with Optuna, over an engine without processes whose curves follow from the learning rate."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

@@ -1,7 +1,5 @@
 """What tuning tries and how it scores: spaces, curves, budgets, and the study that judges the best settings."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

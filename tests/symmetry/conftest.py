@@ -1,7 +1,5 @@
 """Made-up tasks that hold every field kind, so that the mathematics is tested apart from any real task."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

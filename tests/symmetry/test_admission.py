@@ -1,7 +1,5 @@
 """Which groups a task carries, and how the others are refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

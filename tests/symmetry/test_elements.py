@@ -1,7 +1,5 @@
 """The convention, by hand: which way things turn, which product comes first."""
 
-from __future__ import annotations
-
 from fractions import Fraction
 
 import numpy as np

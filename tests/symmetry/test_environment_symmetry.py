@@ -5,8 +5,6 @@ negates coordinates, which commutes with every sum of two squares: rewards and p
 Other turns, and other orders of agents (which reorder sums), round differently; stiff contacts magnify that a little.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -3,8 +3,6 @@
 The worlds start from a jam around the middle, which robots that drive straight at their goals have made.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Group axioms, over a registry of groups."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The maps that commute with a group are found, all of them and no other."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

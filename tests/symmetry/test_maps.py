@@ -1,7 +1,5 @@
 """What stands around the data, and what is wrong in it: autocast, other types, inf and NaN."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import Tensor

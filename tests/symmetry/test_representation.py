@@ -1,7 +1,5 @@
 """L_g and K_g: by hand, as homomorphisms over random layouts, and against a world whose observations are computed."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rings of rays, records of several numbers, and actions that share a meaning."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

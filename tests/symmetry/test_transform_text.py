@@ -1,7 +1,5 @@
 """What a user may write, and what one sentence she gets for the rest."""
 
-from __future__ import annotations
-
 import pytest
 
 from esp_cli.symmetry import FiniteGroup, Group, mirror, parse, parse_elements, parse_group

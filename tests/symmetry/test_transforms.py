@@ -1,7 +1,5 @@
 """Transforms of batches against elementwise definitions, and the drawing of elements."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """Pictures turn by moving pixels, and Eq. 5 and 6 hold exactly in wildlife monitoring."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Action spaces of made-up tasks."""
 
-from __future__ import annotations
-
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Continuous, Discrete, Field, Kind, layout
 
 FOUR_DIRECTIONS = Discrete(Kind.VECTOR, ((0.0, 0.0), LEFT, RIGHT, DOWN, UP), ("stay", "left", "right", "down", "up"))

@@ -7,8 +7,6 @@ Every case follows from the seed and its number alone, so that a finding is repe
 JSON file; the next call with the same file goes on where this one ended. The exit code is 1 if there are findings.
 """
 
-from __future__ import annotations
-
 import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")

@@ -1,7 +1,5 @@
 """Real disks that are full or read-only: small file systems in memory, mounted where only one process sees them."""
 
-from __future__ import annotations
-
 import ctypes
 import functools
 import os

@@ -1,7 +1,5 @@
 """Spoilt files of every kind that is read: only the right content or one sentence, in bounded time and memory."""
 
-from __future__ import annotations
-
 import contextlib
 import copy
 import functools

@@ -4,8 +4,6 @@ The oracle knows no transform: the copies of a copy are the copies of its origin
 original.
 """
 
-from __future__ import annotations
-
 import itertools
 import random
 from collections.abc import Callable

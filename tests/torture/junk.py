@@ -1,7 +1,5 @@
 """Spoilt content: by bytes, and by the structure of JSON and of safetensors."""
 
-from __future__ import annotations
-
 import copy
 import json
 import random

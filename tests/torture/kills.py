@@ -1,7 +1,5 @@
 """Kills at random moments and at named places; afterwards a run, or a study, equals one that nobody disturbed."""
 
-from __future__ import annotations
-
 import gc
 import os
 import random

@@ -1,7 +1,5 @@
 """Limits of time that hold on a busy machine too."""
 
-from __future__ import annotations
-
 import contextlib
 import signal
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Wrong command lines, from the commands' own parameters and the settings' own models: each ends in one sentence."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import random

@@ -5,8 +5,6 @@ right map of an element over, then maps with one mistake of each kind. A mistake
 not count.
 """
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable, Iterator
 from dataclasses import replace

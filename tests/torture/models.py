@@ -4,8 +4,6 @@ Every command runs in a fork with a limit of time and memory, since the reader i
 the folder outside tells whether a file of it was opened.
 """
 
-from __future__ import annotations
-
 import ast
 import ctypes
 import json

@@ -1,7 +1,5 @@
 """Tiny runs of everything that can be trained, how they are trained, and what they leave."""
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 from collections.abc import Iterator

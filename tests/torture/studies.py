@@ -1,7 +1,5 @@
 """Studies of two runs at once, whose scheduler, any job, or everything is killed; jobs are forks or real processes."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import os

@@ -1,7 +1,5 @@
 """Real full and read-only disks: training ends with one sentence and exit code 1, and goes on where there is room."""
 
-from __future__ import annotations
-
 import pytest
 
 from esp_cli.training.build import build_learner

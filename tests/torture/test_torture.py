@@ -1,7 +1,5 @@
 """A small part of the assault in every test run, and the assault's own negative controls."""
 
-from __future__ import annotations
-
 import random
 
 import pytest

@@ -1,7 +1,5 @@
 """Checkpoint files: what goes in comes out, and whatever else is in a file ends in one CheckpointError."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """A configuration gives its command line, and the command line the configuration."""
 
-from __future__ import annotations
-
 import json
 import shlex
 

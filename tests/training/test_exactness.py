@@ -1,7 +1,5 @@
 """What is equal bit for bit and what to rounding: a seed alone and among others, and one thread and two."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

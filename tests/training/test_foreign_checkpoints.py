@@ -1,7 +1,5 @@
 """Checkpoints of other runs and of other configurations are neither resumed nor removed."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What measures an hour of training finds a command that leaks memory or files, and passes one that does not."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

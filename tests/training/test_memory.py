@@ -1,7 +1,5 @@
 """A run that needs more memory than the machine has is refused before the memory is taken."""
 
-from __future__ import annotations
-
 import pytest
 
 from esp_cli.algorithms.presets import ALGORITHMS

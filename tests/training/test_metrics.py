@@ -1,7 +1,5 @@
 """Metrics files: rows per update and seed, torn ends, resuming."""
 
-from __future__ import annotations
-
 import json
 import math
 

@@ -1,7 +1,5 @@
 """Run folders: made whole, never over something foreign, locked by one process, resumed from a good checkpoint."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """The script that measures the seconds until training solves a task measures what it says."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The script that sets this working tree against an older commit measures what it says."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

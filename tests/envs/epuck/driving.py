@@ -1,7 +1,5 @@
 """Put robots into worlds, drive them into each other, and measure how near they come."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from esp_envs.epuck.engines import make_physics

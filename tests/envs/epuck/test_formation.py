@@ -1,7 +1,5 @@
 """Formation change: rewards, metrics, observations and starts by hand, and the anchors of its numbers."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How one robot moves in each engine, and what the engines refuse."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """Robots, walls and pillars stop each other, and nobody gains energy by it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

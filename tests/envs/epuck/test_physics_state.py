@@ -1,7 +1,5 @@
 """A world's future depends on its state alone: not on its past, its neighbours, or the number of threads."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -3,8 +3,6 @@
 Rounding differs between the worlds, contacts magnify it, and robots that push each other in a heap magnify it most.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

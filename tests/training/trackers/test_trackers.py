@@ -1,7 +1,5 @@
 """Trackers get what the metrics file holds, write into the run folder alone, and stop no run whatever they do."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
