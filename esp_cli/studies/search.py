@@ -65,8 +65,6 @@ class Search(RunSet):
         try:
             storage = optuna.storages.JournalStorage(JournalFileBackend(str(journal), lock_obj=_NoLock()))
             self.studies = {prior: self._study(storage, prior) for prior in tuning.priors}
-        except UserError:  # the folder is lost
-            raise
         except Exception as error:  # whatever Optuna stumbles over
             raise self._damaged(shortened(str(error))) from None
         for prior in tuning.priors:
