@@ -43,7 +43,6 @@ def anchors(text: str) -> set[str]:
 
 
 def broken_links(page: Path) -> list[str]:
-    """Return the relative links of a page that lead nowhere."""
     broken = []
     for link in _LINK.findall(prose(page.read_text(encoding="utf-8"))):
         if _ELSEWHERE.match(link):

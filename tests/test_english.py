@@ -29,7 +29,6 @@ def sentences(page: str) -> Iterator[str]:
 
 
 def complaints(page: str) -> list[str]:
-    """Return what is wrong with the English of a page, a line each."""
     found = []
     for sentence in sentences(page):
         found += [f"'{word[0]}' in: {sentence}" for word in _AVOIDED.finditer(sentence)]

@@ -112,7 +112,6 @@ def modules(root: Path) -> Iterator[tuple[Path, str, bool]]:
 
 
 def violations(root: Path) -> list[str]:
-    """Return one line per forbidden import under the source roots of `root`."""
     found = []
     for path, module, is_package in modules(root):
         for line, imported in imports_of(path.read_text(encoding="utf-8"), module, is_package):

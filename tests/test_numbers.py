@@ -115,7 +115,6 @@ def end_of(rows: list[list[float]]) -> list[float]:
 
 @cache
 def constants() -> frozenset[float]:
-    """Return the decimal literals of the packages."""
     sources = [file for folder in ("esp_cli", "environments") for file in (ROOT / folder).rglob("*.py")]
     nodes = (node for file in sources for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))))
     return frozenset(node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, float))

@@ -9,8 +9,6 @@ over its iterations, taken from the times in metrics.jsonl. The figure of a case
 new / old; above 1 the working tree is faster. Ratios mean something on an idle machine only.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -7,8 +7,6 @@ A script and no command: it needs the packages of all tasks, which no user needs
 task that is there is not checked again. What cannot be imported is listed as not run.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import json

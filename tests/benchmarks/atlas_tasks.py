@@ -1,7 +1,5 @@
 """Layouts of tasks of others for the atlas, a few lines each: mpe2, SISL, Gymnasium's MuJoCo, level-based foraging."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -6,8 +6,6 @@ The reward families come in turn, so 24 tasks have one each. A task counts as lo
 minus plain, over paired seeds, lies below 0. A run that was stopped goes on in the file.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import time
@@ -70,7 +68,6 @@ def trained(task: str, recipe: int, kind: str, steps: int, seeds: int) -> tuple[
 
 
 def main() -> None:
-    """Print a line for each task and write the file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tasks", type=int, default=24)
     parser.add_argument("--first", type=int, default=3000, help="seed of the first random task")

@@ -8,8 +8,6 @@ the tolerance counts as neither. The built-in tasks declare nothing here. Withou
 be; with it, transitions of the random policy are all there is.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

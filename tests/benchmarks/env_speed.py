@@ -7,8 +7,6 @@ step, whatever the number of agents. Each figure is the median of several runs o
 programs use the machine too, the rate per second of processor time says more than the rate per second on the clock.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import statistics

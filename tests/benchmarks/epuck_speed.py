@@ -57,7 +57,6 @@ def of_physics(engine: str, worlds: int, threads: int) -> Callable[[], object]:
 
 
 def of_formation(engine: str, worlds: int, threads: int) -> Callable[[], object]:
-    """Return what takes one step of all worlds of the task."""
     torch.set_num_threads(threads)
     env = make("formation", worlds, [0], {"physics": engine})
     env.reset()

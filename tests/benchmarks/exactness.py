@@ -6,8 +6,6 @@ Each figure is the largest difference of a weight of the policy. Worlds, network
 so that torch chooses the routines that a user gets; with --small they have the sizes of the tests.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Sequence
 
@@ -66,7 +64,6 @@ def weights(
 
 
 def main() -> None:
-    """Print a row for each learner."""
     parser = argparse.ArgumentParser(prog="python tests/benchmarks/exactness.py")
     parser.add_argument("--task", default="navigation")
     parser.add_argument("--iterations", type=int, action="append")

@@ -10,8 +10,6 @@ between the distributions of each joint's position and of the mirrored position 
 Wasserstein's distance in standard deviations, averaged over the joints. 0 is the same gait to both sides.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

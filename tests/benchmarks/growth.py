@@ -9,8 +9,6 @@ count. The growth of files is the difference between the medians of the last and
 The command gets SIGTERM at the end. The exit code is 1 if a growth is above its bound.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import json

@@ -6,8 +6,6 @@ The library: what `from esp_cli import Symmetry` takes beyond torch and numpy. T
 train nothing.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
@@ -40,7 +38,6 @@ def commanded(words: str) -> float:
 
 
 def main() -> None:
-    """Print the medians, and write them as JSON where asked."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, help="also write seconds of processor time by case to this file")
     file = parser.parse_args().json

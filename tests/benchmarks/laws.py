@@ -1,7 +1,5 @@
 """Rewards, forces and noise of random tasks, by family: some members are symmetric, others broken."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -105,7 +103,6 @@ def rewards(rng: Rng, agents: int) -> dict[str, Law]:
 
 
 def forces(rng: Rng, agents: int) -> dict[str, Law]:
-    """Return a member of each family of forces on agents, [..., N, 2]."""
     u, place, size = _any(rng), _places(rng, 1)[0], float(rng.uniform(0.1, 0.5))
     turn = float(rng.choice([0.3, 0.7, math.pi / 4]))
     weak = torch.ones(agents)

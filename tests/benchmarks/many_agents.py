@@ -3,8 +3,6 @@
 python tests/benchmarks/many_agents.py runs/three --json docs/measured/many-agents.json
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import time
@@ -26,7 +24,6 @@ AGENTS = 16_000
 
 
 def played(trained: TrainedPolicy, settings: dict[str, object]) -> dict[str, Any]:
-    """Evaluate a policy under settings, with fewer episodes of more agents."""
     episodes = max(2, 128 // int(settings["num_agents"]))
     found = evaluate(trained.transfer(settings), episodes).model_dump(mode="json")
     return {"settings": settings, **{key: found[key] for key in ("episodes", "anchors", "anchor_metrics")}} | {

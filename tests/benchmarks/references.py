@@ -4,8 +4,6 @@ They need no training: random actions, and those written by hand. One more looks
 agents: the agents share out the eight outer places of a 3 x 3 grid, by least distance, and fly there.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from operator import methodcaller

@@ -7,8 +7,6 @@ The rewards of the training worlds alone are changed, and evaluations see the ta
 r where a two-sided Welch test of its seeds against those of r gives p < 0.05 / cells of its row (Bonferroni).
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import statistics

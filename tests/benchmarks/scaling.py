@@ -7,8 +7,6 @@ each kind from 16 agents on, about 1,000 agents in all worlds together. Worlds: 
 Processes: of ten seeds each, side by side, of one thread or two. Each figure is the median of several iterations.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
@@ -58,7 +56,6 @@ def side_by_side(processes: int, threads: int) -> float:
 
 
 def drawn(found: dict[str, dict[str, float]]) -> Figure:
-    """Return the four figures side by side."""
     figure = Figure(figsize=(13, 3), layout="constrained")
     for axes, (title, rates) in zip(figure.subplots(1, 4), found.items(), strict=True):
         counts = all(name.isdecimal() for name in rates)

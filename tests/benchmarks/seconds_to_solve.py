@@ -9,8 +9,6 @@ process and end when this evaluation stands in metrics.jsonl. The table has the 
 the least and the most. Seconds mean something on an idle machine only.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

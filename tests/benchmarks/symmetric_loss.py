@@ -27,7 +27,6 @@ AGENTS, ROWS, HIDDEN, PAIRS = 3, 400, 256, 40
 
 
 def perceptron(inputs: int, outputs: int) -> nn.Sequential:
-    """Return a network of two hidden layers."""
     return nn.Sequential(
         nn.Linear(inputs, HIDDEN), nn.Tanh(), nn.Linear(HIDDEN, HIDDEN), nn.Tanh(), nn.Linear(HIDDEN, outputs)
     )
@@ -57,7 +56,6 @@ def rows(count: int) -> TensorDict:
 
 
 def seconds(loss: Any, data: TensorDict) -> float:
-    """Return the time of a forward and a backward pass."""
     begun = time.process_time()
     losses = loss(data.clone(False))
     (losses["loss_objective"] + losses["loss_critic"]).backward()

@@ -11,8 +11,6 @@ measured in the same process on the largest product of an update. Each figure is
 (collect and update) after a warm-up; where other programs use the machine, look at the most.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import statistics

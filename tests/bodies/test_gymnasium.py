@@ -94,7 +94,6 @@ def reached(env, state, action):
 
 
 def flipped(layout, name, row):
-    """Return a layout with one wrong sign under flip-x."""
     fields = []
     for field in layout.fields:
         if field.name == name:

@@ -70,8 +70,6 @@ def test_landmarks_have_the_name_by_which_a_role_sees_them() -> None:
 
 
 class Noisy(BatchedTask):
-    """One agent walks on a line; its reward is |x| and noise that is as large where x > 0 as where it is not."""
-
     def _describe(self):
         place = layout(Field("place", Kind.PSEUDOSCALAR))
         return TaskSpec(

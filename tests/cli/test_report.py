@@ -19,7 +19,6 @@ from tests.cli.running import DAMAGE, esp, refused, train_tiny
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of the same seeds without the prior."""
     return train_tiny(tmp_path_factory.mktemp("runs") / "plain", "--seed-list", "3,7", "--prior", "none")
 
 

@@ -69,7 +69,6 @@ def test_a_narrow_terminal_shortens_the_bar_before_step_rate_and_time(width, bar
 
 
 def at_80(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> list[str]:
-    """Return what a command prints on a terminal of 80 columns."""
     terminal = Console(width=80, height=10_000, force_terminal=True, color_system=None, highlight=False)
     monkeypatch.setattr(console, "out", terminal)
     monkeypatch.setattr(streams, "out", terminal)
@@ -203,7 +202,6 @@ SEVERAL = ("--steps", "-n", "--prior")
 
 
 def clashes(commands: Iterable[Any]) -> set[str]:
-    """Return the options that take one kind of value in one command and another kind in another."""
     kinds: dict[str, set[object]] = {}
     for command in commands:
         for one in command.params:

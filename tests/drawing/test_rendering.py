@@ -264,8 +264,6 @@ def test_an_mp4_holds_the_frames_at_their_rate(tmp_path):
 
 
 class Space:
-    """A view in space that shows a grey picture."""
-
     note = "drawn in grey"
 
     def draw(self, scene, trail=()):

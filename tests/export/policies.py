@@ -69,7 +69,6 @@ def drawn_policy(
 
 
 def imported(file: Path) -> SimpleNamespace:
-    """Run an exported Python file as a module."""
     return SimpleNamespace(**runpy.run_path(str(file)))
 
 

@@ -24,7 +24,6 @@ WIDTH = 445
 
 
 def numpy_policy(program: Program) -> NumpyPolicy:
-    """Return a program as an exported Python file runs it."""
     return NumpyPolicy(json.loads(json.dumps(program.describe())), program.weights)
 
 

@@ -32,7 +32,6 @@ def registries_as_before(monkeypatch):
 
 @pytest.fixture
 def saved(tmp_path, monkeypatch):
-    """Save the files of both pages in the working directory."""
     monkeypatch.chdir(tmp_path)
     shutil.copy(PAGES / "reinforce.py", tmp_path)
     text = (PAGES / "add-a-network.md").read_text(encoding="utf-8")

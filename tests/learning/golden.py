@@ -119,7 +119,6 @@ _NO_WEIGHTS = ("optimiser.", "generators.", "collector.", "counters", "replay.")
 
 
 def train(case: str, folder: Path, *changes: str) -> str:
-    """Train one case in a new folder and return the hash of its final weights."""
     arguments = ["train", *shlex.split(CASES[case]), *_QUIET, *changes, "--out", str(folder)]
     result = CliRunner().invoke(app, arguments)
     if result.exit_code:

@@ -151,8 +151,6 @@ def test_the_equivariant_network_for_vectors_is_exact_and_a_perceptron_is_not(ta
 
 
 class Echo(Memoryless):
-    """Shows what it is asked about."""
-
     def forward(self, x: Tensor) -> Tensor:
         return x
 

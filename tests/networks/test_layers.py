@@ -16,7 +16,6 @@ def generators(*seeds):
 
 
 def reference(mlp, x):
-    """The perceptron by torch's own operations."""
     for k, layer in enumerate(mlp.layers):
         x = torch.baddbmm(layer.bias, x, layer.weight)
         if k < len(mlp.layers) - 1 or mlp.activate_output:

@@ -32,8 +32,6 @@ class Masked(SeedBatch):
 
 
 class Squared:
-    """A head whose divergence is the squared distance of its outputs."""
-
     def divergence(self, p, q):
         return (p - q).square().sum(-1)
 

@@ -27,7 +27,6 @@ FLAT = Curve("MAPPO-ESP", [0, 100], [[3.0], [3.0]])
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """The figures that were written, to look into."""
     figures = []
     save = Figure.savefig
 

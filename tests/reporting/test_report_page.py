@@ -49,8 +49,6 @@ def page(tmp_path_factory) -> Path:
 
 
 class Loads(HTMLParser):
-    """Collects what a page would load."""
-
     def __init__(self) -> None:
         super().__init__()
         self.found: list[str] = []

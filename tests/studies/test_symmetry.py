@@ -23,13 +23,11 @@ MEASURED = Path(__file__).parents[2] / "docs" / "measured" / "sets-orders-3.json
 
 
 def benchmark(budget: int = 3, **choice: Any) -> Benchmark:
-    """A small benchmark of two methods on navigation."""
     defaults = {"tasks": ("navigation",), "variants": ("plain", "ESP"), "seeds": (0, 1, 2, 3), "episodes": 4}
     return Benchmark(Request(**(defaults | choice)), budget)
 
 
 def write_trials(path: Path, asked: Benchmark, ends: dict[str, float]) -> Trials:
-    """Write trials whose last evaluation is the one by name, 0 for those without."""
     folder = Trials.create(path, asked.trials)
     for cell in folder.study.cells:
         run, end = folder.prepare(cell), ends.get(cell.name, 0.0)

@@ -146,7 +146,6 @@ def test_transforming_rows_equals_observing_the_transformed_world() -> None:
 
 
 def random_layout(rng: np.random.Generator, num_agents: int):
-    """Return a random layout of one to six fields of all kinds and ways of counting."""
     counts = {Items.FIXED: None, Items.OTHERS: num_agents - 1, Items.AGENTS: num_agents}
     fields = []
     for i in range(rng.integers(1, 7)):

@@ -133,7 +133,6 @@ class Files(Part):
         }
 
     def _forge(self, name: str, path: Path, rng: random.Random) -> None:
-        """Write a file whose checksum is right and whose tensors or description are not."""
         tensors, meta = self._originals[name]
         tensors, described = dict(tensors), dict(meta)
         if rng.random() < 0.5:
@@ -158,7 +157,6 @@ class Files(Part):
 
 
 def _make_sound_files(scratch: Path) -> None:
-    """Write one sound file of each kind, as the application does."""
     folder = tiny_folder(scratch / RUN, steps=100)
     with folder.lock():
         Trainer(parse_config(folder.config, folder.path), folder).run(lambda news: True)

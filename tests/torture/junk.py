@@ -72,7 +72,6 @@ def spoil_json(content: bytes, rng: random.Random) -> bytes:
 
 
 def spoil_header(content: bytes, rng: random.Random) -> bytes:
-    """Return a safetensors file whose header, or whose description in it, is changed."""
     (length,) = struct.unpack_from("<Q", content)
     header = json.loads(content[8 : 8 + length])
     if rng.random() < 0.5:

@@ -37,8 +37,6 @@ class Reference:
 
 
 class Kills(Part):
-    """Cases of one run or study each, interrupted several times."""
-
     def __init__(self, scratch: Path, seed: int) -> None:
         self.scratch, self.seed = scratch / "kills", seed
         self.scratch.mkdir()

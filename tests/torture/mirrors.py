@@ -109,7 +109,6 @@ def _wrong(seen: np.ndarray, acted: np.ndarray, body: Body, numbers: Numbers) ->
 def mistakes(
     seen: np.ndarray, acted: np.ndarray, numbers: Numbers, rng: random.Random
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Yield the kind of a mistake and both maps with it."""
     places, count = numbers["policy"].slices(), len(acted)
     joints, (k, other) = places["positions"], rng.sample(range(count), 2)
 

@@ -29,8 +29,6 @@ class Part:
 
 @dataclass
 class Finding:
-    """What was found by which case."""
-
     part: str
     number: int
     text: str
@@ -65,7 +63,6 @@ class Record:
         return cls(path=path, **found)
 
     def run(self, name: str, part: Part, end: float, until: int) -> None:
-        """Run cases of a part until the time is over or it counts `until`."""
         begun = saved = time.monotonic()
         earlier = self.seconds.get(name, 0.0)
         while time.monotonic() < end and self.counts.get(name, 0) < until:

@@ -74,7 +74,6 @@ def run_job(path: Path, config: RunConfig) -> None:
 
 
 def newest_step(path: Path) -> int:
-    """Return the step of the newest checkpoint of a run, -1 where there is none."""
     names = [file.name for file in (path / "checkpoints").glob("step-*.safetensors")]
     return max((int(name[5:17]) for name in names), default=-1)
 

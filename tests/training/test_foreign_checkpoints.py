@@ -13,7 +13,6 @@ from tests.training.runs import tiny_folder
 
 
 def finished_folder(path: Path, steps: int = 300) -> Path:
-    """A finished run of another prior, with a checkpoint before its last one."""
     folder = tiny_folder(path, steps=steps, seeds=(7, 8), prior__kind="none")
     trainer.Trainer(parse_config(folder.config, path), folder).run(lambda news: True)
     return path

@@ -47,7 +47,6 @@ class Record(Callback):
 
 
 def run(seed: int, frames: int) -> list[Row]:
-    """Train once; return the rows."""
     config = ExperimentConfig.get_from_yaml()
     config.loggers, config.create_json, config.evaluation, config.render = [], False, False, False
     config.prefer_continuous_actions, config.max_n_frames = False, frames

@@ -59,5 +59,4 @@ def gap_to_pillars(pose: Array, pillars: Array, radius: float) -> float:
 
 
 def gap_to_walls(pose: Array, side: float) -> float:
-    """Return the least distance between a body and a wall, m."""
     return float(side / 2 - BODY_RADIUS_M - np.abs(pose[..., :2]).max())

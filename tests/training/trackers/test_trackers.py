@@ -31,8 +31,6 @@ def test_a_metric_is_a_mean_and_one_number_per_seed_and_left_out_where_a_seed_ha
 
 
 class Failing:
-    """A tracker that fails in one of its three ways."""
-
     way = "open"
     rows = closed = 0
 
