@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from esp_cli.training.config import RunConfig
+    from esp_cli.training.settings import ConfigFile
 
 _PARAMETERS = {"algorithm": "algo"}  # names of parameters that differ from those in a file
 
@@ -27,24 +28,28 @@ def plan_run(
     from esp_cli.machine import resolve_device
     from esp_cli.run import plan
     from esp_cli.training.config import resolve_config
+    from esp_cli.training.settings import read_config_file
 
     chosen = set(settings)
-    if file is not None:
-        choices, settings, chosen = _with_file(context, file, choices, settings)
+    told = None if file is None else read_config_file(file)
+    if told is not None:
+        choices, settings, chosen = _with_file(context, told, choices, settings)
     start = choices.pop("init_from")
     choices["device"] = resolve_device(choices["device"])
     idle = chosen & resolve_config(**choices, overrides=settings).without_effect()
     config, weights = plan(algo=choices.pop("algorithm"), settings=settings, init_from=start, **choices)
+    repeated = None if told is None or was_given(context, "init_from") else told.config
+    if repeated and repeated.seeds == config.seeds and repeated.init_from != config.init_from:
+        raise UserError(f"{start} holds other weights than the run of {file} started from; add --init-from POLICY")
     return config, weights, idle
 
 
 def _with_file(
-    context: typer.Context, path: Path, given: dict[str, Any], settings: dict[str, object]
+    context: typer.Context, file: ConfigFile, given: dict[str, Any], settings: dict[str, object]
 ) -> tuple[dict[str, Any], dict[str, object], set[str]]:
     from esp_cli.prior.config import SAID_BY_AUTO
-    from esp_cli.training.settings import read_config_file
 
-    file = read_config_file(path)
+    path = file.path
     named = {name for name in given if was_given(context, _PARAMETERS.get(name, name))}
     named |= {"seeds"} if was_given(context, "seed_list") else set()
     if file.config is not None:

@@ -74,13 +74,16 @@ def test_a_configuration_of_a_started_run_starts_there_again(finished: Path, tmp
     assert printed("--config", run) == stored_config(run)
 
 
-def test_a_configuration_starts_from_the_policy_as_it_is_now(copied: Path, tmp_path: Path) -> None:
+def test_a_run_is_not_repeated_from_other_weights_unless_that_is_asked_for(copied: Path, tmp_path: Path) -> None:
     run = train_tiny(tmp_path / "run", "--seed-list", "3,7", "--init-from", copied, steps=50)
     before = stored_config(run)["init_from"]
     shutil.rmtree(copied)
     assert "does not exist" in refused("train", "--config", run, "--print-config")
     train_tiny(copied, "--seed-list", "3,7", "--set", "mappo.learning_rate=0.05")
-    now = printed("--config", run)["init_from"]
+    assert refused("train", "--config", run, "--print-config") == (
+        f"{copied} holds other weights than the run of {run} started from; add --init-from POLICY"
+    )
+    now = printed("--config", run, "--init-from", copied)["init_from"]
     assert now["source"] == before["source"]
     assert now["sha256"] != before["sha256"]
 
