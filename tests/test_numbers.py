@@ -29,7 +29,7 @@ MADE = ("atlas.md", "robot-models.md", "dependencies.md")
 """Pages that a command writes."""
 PAGES = [ROOT / "README.md", *(page for page in sorted((ROOT / "docs").rglob("*.md")) if page.name not in MADE)]
 OF_RULES = [page for page in PAGES if page.parent.name == "docs" and page.name not in ("index.md", "gallery.md")]
-OPEN = {"docs/measurements/speed.md": 13}
+OPEN = {"docs/measurements/speed.md": 12}
 """Page -> how many of its decimals are on no record yet: it falls with each file, and never rises."""
 BLOCK = re.compile(r"<!-- (?:results|scores): .*?<!-- end of results -->", re.DOTALL)
 FENCE = re.compile(r"^ *(```|~~~).*?^ *\1", re.DOTALL | re.MULTILINE)
