@@ -69,6 +69,13 @@ def _holder(content: bytes) -> str:
         return "another process"
 
 
+def own_folder(path: Path) -> Path:
+    """Return the path of a folder of our own, which need not exist yet; a link there is refused."""
+    if path.is_symlink():
+        raise _irregular(path)
+    return path
+
+
 def open_own(path: str | os.PathLike[str], flags: int) -> int:
     """Return a descriptor of a regular file of our own, made if missing; a link is refused, a pipe does not block."""
     try:

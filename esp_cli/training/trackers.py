@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from esp_cli.files.documents import flat
+from esp_cli.files.opening import own_folder
 from esp_cli.files.writing import replace_file
 from esp_envs.errors import UserError
 from esp_envs.installed import install
@@ -51,8 +52,8 @@ class TensorBoard:
         if seed not in self._boards:
             from torch.utils.tensorboard import SummaryWriter  # noqa: PLC0415 - only where it is asked for
 
-            folder = self._run.folder / "tensorboard"
-            place = folder if seed is None else folder / f"seed-{seed}"
+            folder = own_folder(self._run.folder / "tensorboard")
+            place = folder if seed is None else own_folder(folder / f"seed-{seed}")
             # what a resumed run writes again is hidden, also where it begins anew without a checkpoint
             purge = self._run.first_step + 1 if self._run.first_step else 0
             self._boards[seed] = SummaryWriter(str(place), purge_step=purge, flush_secs=10)
@@ -67,7 +68,7 @@ class WeightsAndBiases:
 
         self._seeds = run.seeds
         folder = run.folder.absolute()
-        store = folder / "wandb"
+        store = own_folder(folder / "wandb")
         places = {f"WANDB_{place}_DIR": str(store / place.lower()) for place in ("CACHE", "CONFIG", "DATA", "ARTIFACT")}
         self._set = [name for name in places if name not in os.environ]  # until the run closes: the next has its own
         os.environ.update({name: places[name] for name in self._set})
@@ -119,7 +120,7 @@ class MlFlow:
         from mlflow.tracking import MlflowClient  # noqa: PLC0415
 
         folder = run.folder.absolute()
-        store = folder / "mlruns"
+        store = own_folder(folder / "mlruns")
         self._seeds, self._metric = run.seeds, Metric
         self._client = MlflowClient(os.environ.get("MLFLOW_TRACKING_URI") or store.as_uri())
         found = self._client.get_experiment_by_name("esp")

@@ -206,3 +206,16 @@ def test_a_resumed_run_is_one_run_for_its_tracker(tmp_path: Path, name: str, mon
     assert not {name for name in os.environ if name.endswith("_DIR") and name.startswith("WANDB_")}, (
         "the next run's own"
     )
+
+
+def test_a_link_at_the_folder_of_a_tracker_is_not_followed(tmp_path):
+    pytest.importorskip("tensorboard")
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "tensorboard").symlink_to(tmp_path / "outside")
+    notes: list[str] = []
+    (sink,) = trackers.open_trackers(["tensorboard"], trackers.TrackedRun(tmp_path / "run", (0,), {}), notes.append)
+    sink.write(100, {"train/loss": [1.0]})
+    sink.close()
+    assert list((tmp_path / "outside").iterdir()) == []
+    assert "a link or no regular file is there" in notes[0]
