@@ -14,12 +14,14 @@ import sys
 from collections.abc import Iterator, Mapping
 from difflib import get_close_matches
 from importlib import import_module, invalidate_caches
-from importlib.metadata import EntryPoint, entry_points, requires
 from inspect import isabstract
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from esp_envs.errors import UserError
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 T = TypeVar("T")
 FURTHER: dict[str, dict[str, str]] = {}
@@ -142,6 +144,8 @@ def import_function(name: str) -> Any:
 
 def entries(group: str) -> list[EntryPoint]:
     """Return what packages install, and those that are `FURTHER`; none is imported."""
+    from importlib.metadata import EntryPoint, entry_points  # noqa: PLC0415 - which `esp --help` can do without
+
     added = FURTHER.get(group, {}).items()
     return [*(EntryPoint(name, target, group) for name, target in added), *entry_points(group=group)]
 
@@ -172,6 +176,8 @@ def last_line(error: BaseException) -> str:
 
 def install(extra: str) -> str:
     """Return the command that installs what an extra needs, from any index: "pip install 'optuna>=4.2'"."""
+    from importlib.metadata import requires  # noqa: PLC0415 - as above
+
     rows = (row.replace('"', "'").split(";") for row in requires("esp-marl") or [])
     needed = [row[0].strip() for row in rows if row[-1].strip() == f"extra == '{extra}'"]
     return " ".join(["pip install", *(f"'{package}'" for package in needed)])

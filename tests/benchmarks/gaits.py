@@ -98,7 +98,7 @@ def main() -> None:
     for task in chosen.tasks:
         words = ["--task", task, "--algo", "mappo", "--prior", "esp,none", "--steps", of_task.get(task, of_all)]
         words += ["--budget", chosen.budget, "--seeds", chosen.seeds, "--jobs", chosen.jobs]
-        words += ["--out", str(chosen.out / task)]
+        words += ["--out", str(chosen.out / task), "--episodes", str(EPISODES)]
         words += [word for one in chosen.set for word in ("--set", one)]
         subprocess.run([sys.executable, "-m", "esp_cli", "tune", *words], check=True)
         found[task] = {path.name: measured(path) for path in sorted((chosen.out / task / "fresh" / "runs").iterdir())}

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import esp_envs
-from esp_envs import Environment, installed, make, register, registry, task_class, task_names
+from esp_envs import Environment, make, register, registry, task_class, task_names
 
 
 @pytest.fixture
@@ -86,7 +86,7 @@ def test_an_installed_task_is_known_by_its_entry_point(monkeypatch: pytest.Monke
         EntryPoint("theirs", "esp_envs.mpe.navigation:Navigation", "esp.tasks"),
         EntryPoint("broken", "no_such_package:Task", "esp.tasks"),
     ]
-    monkeypatch.setattr(installed, "entry_points", lambda group: entries if group == "esp.tasks" else [])
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: entries if group == "esp.tasks" else [])
     assert {"theirs", "broken", "navigation"} <= set(task_names())
     assert issubclass(task_class("theirs"), Environment)
     with pytest.raises(ValueError, match="the installed task 'broken' cannot be imported: ModuleNotFoundError"):
