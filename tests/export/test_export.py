@@ -18,7 +18,7 @@ from tests.export.policies import KINDS, drawn_policy, imported
 
 pytestmark = pytest.mark.usefixtures("few_scenes")
 FAST = ("numpy", "c")
-ALSO_TORCH = ("wheels", "choice, normalised", "values, recurrent", "team", "sets, near")
+ALSO_TORCH = ("wheels", "choice, normalised", "values, recurrent", "team")  # sets: test_sets.py
 needs_cc = pytest.mark.skipif(c_file.compiler() is None, reason="needs a C compiler")
 
 

@@ -68,7 +68,8 @@ def test_an_export_acts_with_any_number(near: int, tmp_path: Path) -> None:
 def test_the_python_file_refuses_tables_that_do_not_fit(tmp_path: Path) -> None:
     program = program_of(drawn_policy("sets").policy)
     assert json.loads(json.dumps(program.describe()))["sets"][0][0] == "landmarks"
-    run = runners(program, tmp_path)["numpy"]
+    (tmp_path / "policy.py").write_bytes(numpy_source(program, "", {}))
+    run = numpy_runner(tmp_path / "policy.py")
     own, landmarks = np.zeros((2, 4), np.float32), np.zeros((2, 3, 2), np.float32)
     for sets, sentence in (
         ({"landmarks": landmarks}, "are needed"),
