@@ -116,6 +116,8 @@ class Body:
                 f"robot, with 1 to {MOST_MOVING} degrees of freedom and at most {MOST_MOVING} actuators and "
                 f"{MOST_BODIES} bodies"
             )
+        if np.any(getattr(model, "actuator_ctrlnum", 1) != 1):
+            raise UserError("the model has actuators of no or several controls; give one with a control for each")
         self, frame = cls([], {}), Frame(model, seconds)
         found, self.refused = find(frame, tolerated)
         self.found = {element.name: one for element, one in found.items()}

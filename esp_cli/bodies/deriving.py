@@ -167,7 +167,8 @@ def _control_map(frame: Frame, qvel: Floats) -> tuple[Floats, tuple[str, ...]]:
     scale = np.abs(moment).max(axis=1, initial=0)
     unit = moment / np.where(scale > 0, scale, 1)[:, None]
     image, ctrl = unit @ qvel.T, np.zeros((model.nu, model.nu))
-    types = np.column_stack([model.actuator_gaintype, model.actuator_biastype, model.actuator_dyntype])
+    dynamics = model.actuator_dyntype, model.actuator_dynprm * (model.actuator_dyntype != 0)[:, None]
+    types = np.column_stack([model.actuator_gaintype, model.actuator_biastype, *dynamics, model.actuator_delay])
     gaps = np.abs(image[:, None] - np.stack([unit, -unit])[:, None]).max(-1, initial=0)
     gap = gaps.min(0) + _APART * (types[:, None] != types).any(-1)
     gap += 0.1 * np.abs(np.subtract.outer(scale, scale)) / max(scale.max(initial=0), 1e-12)

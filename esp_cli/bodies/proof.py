@@ -157,19 +157,23 @@ def _images(match: Match, samples: Sequence[Sample]) -> list[Sample]:
 
 
 def _accelerations(frame: Frame, data: Any, samples: Sequence[Sample], disabled: int) -> Floats:
-    """Return qacc and readings of sensors [states, nv + numbers of sensors] without what the flags disable."""
-    before = frame.model.opt.disableflags
-    frame.model.opt.disableflags = before | disabled
-    found = []
+    """Return qacc and readings of sensors [states, nv + numbers of sensors] without what the flags disable.
+
+    Actuators with dynamics or a delay act as they do once they have followed their controls.
+    """
+    model, found = frame.model, []
+    before, delays = model.opt.disableflags, model.actuator_delay.copy()
+    model.opt.disableflags, model.actuator_delay[:] = before | disabled, 0
     try:
         for sample in samples:
             frame.stop_if_late()
             data.qpos[:], data.qvel[:], data.ctrl[:], data.qfrc_applied[:] = sample
+            data.act[:] = np.repeat(data.ctrl, model.actuator_actnum)
             data.qacc_warmstart[:] = 0
-            mujoco.mj_forward(frame.model, data)
+            mujoco.mj_forward(model, data)
             found.append(np.r_[data.qacc, data.sensordata])
     finally:
-        frame.model.opt.disableflags = before
+        model.opt.disableflags, model.actuator_delay[:] = before, delays
     return np.stack(found)
 
 

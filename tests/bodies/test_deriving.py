@@ -208,6 +208,28 @@ def test_a_site_that_pushes_is_refused_where_no_image_pushes():
     assert body_of(text).refused["flip-x"] == "no image was found of the actuators thruster"
 
 
+@pytest.mark.parametrize(
+    ("own", "left", "right", "group"),
+    [
+        ('dyntype="filter" dynprm="0.1"', 'gainprm="10"', 'gainprm="10"', "flip-x"),
+        ('dyntype="filter" dynprm="0.1"', 'gainprm="10"', 'gainprm="100"', "c1"),
+        ('dyntype="filter"', 'dynprm="0.1"', 'dynprm="0.9"', "c1"),
+        ('delay="0.01" nsample="6"', 'gainprm="10"', 'gainprm="10"', "flip-x"),
+        ('delay="0.01" nsample="6"', 'gainprm="10"', 'gainprm="100"', "c1"),
+        ('nsample="60"', 'delay="0.01"', 'delay="0.1"', "c1"),
+    ],
+)
+def test_actuators_with_dynamics_or_a_delay_are_seen_to_act(own: str, left: str, right: str, group: str) -> None:
+    pair = "".join(f'<general joint="{x}_roll" {own} {how}/>' for x, how in (("left", left), ("right", right)))
+    assert body_of(biped().replace("</actuator>", f"{pair}</actuator>")).group == group
+
+
+def test_actuators_of_several_controls_are_refused() -> None:
+    pids = "".join(f'<pid joint="{x}_roll" kp="10" input="pos vel"/>' for x in ("left", "right"))
+    with pytest.raises(UserError, match="actuators of no or several controls"):
+        body_of(biped().replace("</actuator>", f"{pids}</actuator>"))
+
+
 def test_unnamed_joints_are_numbered_and_accelerations_that_are_no_numbers_prove_nothing(monkeypatch):
     body = body_of(QUADRUPED.replace('name="hip0"', 'name="joint#3"').replace('joint="hip0"', 'joint="joint#3"'))
     assert "joint#3" in body.joints
