@@ -49,16 +49,19 @@ def audit(function: Callable[..., Any], body: Body, numbers: Numbers) -> list[Co
         width = numbers[name].width
         if made.shape[1:] != (width,) or len(made) % count or not len(made):
             raise UserError(f"the function returns {name} {list(made.shape)}; {count} rows of {width} were given")
-        maps[name] = [copy[:width].double().numpy().T for copy in made.split(count)]
-        for matrix, copy in zip(maps[name], made.split(count), strict=True):
+        copies = made.detach().cpu().double().split(count)
+        maps[name] = [copy[:width].numpy().T for copy in copies]
+        for matrix, copy in zip(maps[name], copies, strict=True):
             if not np.allclose(rows[name][-_RANDOM:].numpy() @ matrix.T, copy[-_RANDOM:].numpy(), atol=1e-3):
                 raise UserError(f"the function's {name} are not a linear map of its rows")
-    if not maps:
-        raise UserError(f"the function returns neither observations nor actions as tensors [copies * {count}, width]")
+    times = {name: len(copies) for name, copies in maps.items()}
+    if len({1, *times.values()}) != 2:
+        told = " and ".join(f"{name} {many} times" for name, many in times.items())
+        raise UserError(f"the function returns the rows of {told}; return all rows, then as many copies of each")
     wanted = {"identity": {name: np.eye(numbers[name].width) for name in maps}}
     wanted |= {element.name: {name: map_of(numbers[name], element) for name in maps} for element in body.elements}
-    copies = [dict(zip(maps, copy, strict=True)) for copy in zip(*maps.values(), strict=False)]
-    return [_judged(copy, wanted, numbers, k == 0) for k, copy in enumerate(copies)]
+    found = [dict(zip(maps, copy, strict=True)) for copy in zip(*maps.values(), strict=True)]
+    return [_judged(copy, wanted, numbers, k == 0) for k, copy in enumerate(found)]
 
 
 def _judged(maps: dict[str, Floats], wanted: dict[str, dict[str, Floats]], numbers: Numbers, first: bool) -> Copy:
@@ -108,15 +111,19 @@ def _called(function: Callable[..., Any], numbers: Numbers, rows: dict[str, Tens
     except (Exception, SystemExit) as error:
         raise UserError(f"the function raises {last_line(error)}; it was given {', '.join(known) or ACTION}") from error
     results = tuple(result) if isinstance(result, tuple | list) else (result,)
-    if not set(known) & set(_OBS):
+    if not (seeing := set(known) & set(_OBS)):
         results = (None, results[-1])
     given, acted = (*results, None)[:2]
     try:
-        told = groups[:1] if isinstance(given, Tensor) else [] if given is None else groups
-        found = {group: given if isinstance(given, Tensor) else given[group] for group in told}
+        told = groups if seeing else []
+        found = {group: given if isinstance(given, Tensor) and len(groups) == 1 else given[group] for group in told}
     except (KeyError, IndexError, TypeError, RuntimeError):
         found = {"": None}
     if not all(isinstance(made, Tensor) for made in found.values()):
         expected = f"a tensor, or tensors by group ({', '.join(groups)})"
         raise UserError(f"the function returns {type(given).__name__} as observations; return {expected}")
-    return found | ({ACTION: acted} if isinstance(acted, Tensor) else {})
+    if seeing and not set(known) & set(_ACTIONS):
+        return found
+    if not isinstance(acted, Tensor):
+        raise UserError(f"the function returns {type(acted).__name__} as actions; return a tensor")
+    return found | {ACTION: acted}

@@ -153,7 +153,8 @@ def test_the_audit_names_what_is_wrong_and_what_is_right():
     def forgets_signs(obs, actions):
         return obs, torch.cat([actions, actions[:, [2, 3, 0, 1, 6, 7, 4, 5, 10, 11, 8, 9]]])
 
-    (_, copy) = [*audit(lambda actions: forgets_signs(None, actions)[1], body, numbers_of(body, None))]
+    learned = torch.ones((), requires_grad=True)
+    (_, copy) = [*audit(lambda actions: learned * forgets_signs(None, actions)[1], body, numbers_of(body, None))]
     assert copy.element == "flip-x"
     assert copy.is_involution
     assert copy.wrong[0] == ("actions.LF_HAA", "actions.RF_HAA", "-actions.RF_HAA")
@@ -191,7 +192,10 @@ def test_numbers_that_say_nothing_are_refused(body, tmp_path, monkeypatch, text,
 @pytest.mark.parametrize(
     ("function", "words"),
     [
-        (lambda actions: 1, "neither observations nor actions"),
+        (lambda actions: 1, "returns int as actions; return a tensor"),
+        (lambda obs, actions: (obs.repeat(2, 1), None), "returns NoneType as actions"),
+        (lambda obs, actions: (obs.repeat(3, 1), actions.repeat(2, 1)), "policy 3 times and action 2 times; return"),
+        (lambda obs, actions: (obs, actions), "policy 1 times and action 1 times; return all rows, then as many"),
         (lambda actions: actions[:, :2], "rows of 9 were given"),
         (lambda actions: actions.abs(), "not a linear map"),
         (lambda actions: 1 / 0, "raises ZeroDivisionError"),
