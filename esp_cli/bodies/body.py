@@ -249,12 +249,14 @@ class Body:
             tolerance: rad or m.
 
         Raises:
-            UserError: a joint's image has another angle.
+            UserError: a joint's image has another angle, or a name is none of a joint.
         """
         places = {joint: self._velocities.places[joint].start for joint in self.joints}
         for element, matrix in self._velocities.moves.items():
             angles = np.zeros(len(matrix))
             for joint, angle in pose.items():
+                if joint not in places or not np.isfinite(angle):
+                    raise UserError(f"the pose has {printable(joint)} at {angle}; give joints of it finite angles")
                 angles[places[joint]] = angle
             off = np.abs(matrix @ angles - angles)
             if off.max(initial=0) > tolerance:

@@ -95,7 +95,8 @@ def rows_of(path: Path) -> Floats:
     """Read observations [M, D] of a .npy file."""
     try:
         content = BytesIO(read_regular(path, _MOST_BYTES) or b"")
-        return np.asarray(np.lib.format.read_array(content, allow_pickle=False), np.float64)
+        rows = np.lib.format.read_array(content, allow_pickle=False)
+        return rows.astype(np.float64, casting="same_kind")  # no text, date or complex number
     except (ValueError, TypeError, MemoryError) as error:
         raise UserError(f"{path} is no .npy file of numbers: {last_line(error)}") from None
 

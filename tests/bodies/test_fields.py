@@ -150,6 +150,8 @@ def test_joints_come_in_the_simulators_order():
         (lambda b: b.scan([[1, 0.5], [1, 0]]), "the image of point 0 under flip-x is no point"),
         (lambda b: b.scan([]), "points have shape"),
         (lambda b: b.check_pose({"left_knee": 0.3}), "left_knee is off by 0.3"),
+        (lambda b: b.check_pose({"knee": 0.3}), "the pose has knee at 0.3; give joints"),
+        (lambda b: b.check_pose({"left_knee": np.nan, "right_knee": np.nan}), "the pose has left_knee at nan"),
         (lambda b: Symmetry(observation=layout(b.positions()), action=Continuous(layout(b.controls())), group="d2"),
          "has no such symmetry for its joints; it has flip-x"),
     ],

@@ -85,7 +85,9 @@ def test_files_of_policies_and_rows_are_read_or_refused(tmp_path):
     np.save(tmp_path / "code.npy", np.array([{}], object), allow_pickle=True)
     content = (tmp_path / "rows.npy").read_bytes()
     (tmp_path / "vast.npy").write_bytes(content.replace(b"(3, 2), }" + b" " * 12, b"(3, 2" + b"0" * 11 + b"), } "))
-    for name in ("code.npy", "bad.pt", "vast.npy"):
+    np.save(tmp_path / "waves.npy", np.ones((3, 2), complex))
+    np.save(tmp_path / "words.npy", np.array([["1", "2"]]))
+    for name in ("code.npy", "bad.pt", "vast.npy", "waves.npy", "words.npy"):
         with pytest.raises(UserError, match=r"is no \.npy file of numbers"):
             rows_of(tmp_path / name)
 
