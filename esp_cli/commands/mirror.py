@@ -51,6 +51,8 @@ def mirror(
 
     if (emit is None) != (out is None):
         raise UserError("--emit and -o belong together: esp mirror robot.xml --emit rsl_rl -o mirror.py")
+    if out is not None and out.suffix != ".py":
+        raise UserError(f"--emit writes Python, so the name {out} has to end in .py")
     if order is not None and emit is None:
         raise UserError("--order says what is in the file that --emit writes; add --emit, or leave --order out")
     if out is not None and not force and (taken := [path for path in (out, _proof_of(out)) if path.exists()]):

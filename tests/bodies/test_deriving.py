@@ -240,6 +240,14 @@ def test_unnamed_joints_are_numbered_and_accelerations_that_are_no_numbers_prove
     assert body_of(biped()).group == "c1"
 
 
+def test_a_ball_in_the_air_shows_no_mistake_and_so_no_mirror() -> None:
+    ball = '<mujoco><worldbody><body name="ball"><freejoint/><geom size="{}"/></body></worldbody></mujoco>'
+    body = body_of(ball.format("0.1"))
+    assert not body.found
+    assert body.refused["flip-x"] == "not covered: no mistake would show in accelerations"
+    assert body_of(ball.format('0.1 0.2 0.3" type="box')).group == "d2", "the control: it tumbles"
+
+
 def test_models_without_a_joint_are_refused():
     with pytest.raises(UserError, match="0 degrees of freedom"):
         body_of("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")

@@ -233,6 +233,7 @@ def test_the_command_writes_audits_and_refuses(tmp_path, monkeypatch):
     assert "test_my_mirror.py exists" in refused("mirror", "biped.xml", "--emit", "numpy", "-o", "my_mirror.py")
     Path("my_mirror.py").write_text(right)
     assert "belong together" in refused("mirror", "biped.xml", "--emit", "numpy")
+    assert "has to end in .py" in refused("mirror", "biped.xml", "--emit", "numpy", "-o", "my_mirror")
     assert "cannot import" in refused("check", "mirror", "nowhere:mirror", "biped.xml")
     assert "names no function" in refused("check", "mirror", "nowhere", "biped.xml")
     assert "names no function" in refused("check", "mirror", "my_mirror:augment", "biped.xml", "--order", "1:")
