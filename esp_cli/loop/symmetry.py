@@ -13,18 +13,7 @@ from torch import Tensor
 
 from esp_cli.loop import shapes
 from esp_cli.loop.divergence import Policy, policy_divergence
-from esp_cli.loop.shapes import (
-    Augmented,
-    Draws,
-    act,
-    carry,
-    carry_along,
-    check_alike,
-    check_mask,
-    check_state,
-    lead_of,
-    mean_counted,
-)
+from esp_cli.loop.shapes import Augmented, Draws, carry, carry_along, check_alike, check_state, lead_of, mean_counted
 from esp_cli.loop.tensordicts import Role, with_copies
 from esp_cli.prior.losses import value_consistency_loss
 from esp_cli.symmetry import Transform, TransformSet
@@ -93,6 +82,7 @@ class Symmetry(Draws):
         if not self._set(torch.device("cpu"), torch.float32).is_finite and copies == "all":
             raise UserError(f"copies='all' needs a finite group, but '{group}' is infinite or large; use copies='draw'")
 
+    @torch.inference_mode(False)  # as what is kept serves training too
     def transforms(self, like: Tensor) -> list[Transform]:
         """Return the elements of one call, on the device of `like`: one that is drawn, or all."""
         chosen = self._set(like.device, torch.float64 if like.dtype == torch.float64 else torch.float32)
@@ -136,7 +126,7 @@ class Symmetry(Draws):
         def joined(x: Tensor, images: list[Tensor]) -> Tensor:
             return torch.cat([x, *images], dim)
 
-        moved_action = [act(self.spaces, g, action, lead) for g in transforms]
+        moved_action = [shapes.act(self.spaces, g, action, lead) for g in transforms]
         parts = [joined(obs, [g.obs(obs) for g in transforms]), joined(action, moved_action)]
         if state is not None:
             check_state(self.spaces, state, lead)
@@ -190,7 +180,7 @@ class Symmetry(Draws):
         Raises:
             UserError: a shape that does not fit, or a distribution that is not known.
         """
-        check_mask(self.spaces, action_mask, lead_of(self.spaces, obs))
+        shapes.check_mask(self.spaces, action_mask, lead_of(self.spaces, obs))
         masks = () if action_mask is None else (action_mask,)
         here = policy(obs, *masks) if here is None else here
         gaps = [
@@ -292,6 +282,7 @@ class Symmetry(Draws):
         elements, width = self._set(torch.device("cpu"), torch.float64).each(), self.spaces.observation.width
         return [(g.elements[0].name, matrix(g.obs, width), matrix(g.push_outputs, g.num_outputs)) for g in elements]
 
+    @torch.inference_mode(False)
     def _set(self, device: torch.device, dtype: torch.dtype) -> TransformSet:
         key = (device, dtype)
         if key not in self._sets:

@@ -128,6 +128,17 @@ def test_every_floating_type_is_turned_to_its_own_precision(dtype: torch.dtype) 
     assert error <= torch.finfo(dtype).eps
 
 
+@pytest.mark.parametrize("copies", ["draw", "all"])
+def test_gradients_flow_after_a_first_call_in_inference_mode(copies: Any) -> None:
+    obs, action = random(4, 3).double(), torch.zeros(4, dtype=torch.int64)
+    with torch.inference_mode():
+        symmetry = Symmetry(observation=SEEN, action=MOVES, group="c2", copies=copies)
+        symmetry.augment(obs, action)
+    symmetry.augment(obs.requires_grad_(), action).obs.sum().backward()
+    assert obs.grad is not None
+    assert obs.grad.tolist() == [[0, 0, 2]] * 4, "the copy's velocity is the other way"
+
+
 def test_agents_that_change_places_take_their_numbers_along() -> None:
     symmetry = Symmetry(observation=OTHERS, action=MOVES, group="agents-1-2-0", num_agents=3)
     obs, action = random(2, 3, 6), torch.tensor([[0, 1, 2]] * 2)
