@@ -85,10 +85,17 @@ def policy_of(name: str) -> Actor:
         session = runtime.InferenceSession(content, providers=["CPUExecutionProvider"])
     except Exception as error:
         raise UserError(f"{path} is no ONNX model: {last_line(error)}") from None
-    inputs = [given.name for given in session.get_inputs()]
+    inputs = session.get_inputs()
     if len(inputs) != 1:
-        raise UserError(f"{path} takes {', '.join(inputs)}; give a policy of observations alone, without memory")
-    return lambda rows: session.run(None, {inputs[0]: rows.astype(np.float32)})[0]
+        names = ", ".join(given.name for given in inputs)
+        raise UserError(f"{path} takes {names}; give a policy of observations alone, without memory")
+    alone = inputs[0].shape[:1] == [1]  # it was exported for one row
+
+    def act(rows: Floats) -> Any:
+        parts = np.split(rows.astype(np.float32), len(rows) if alone else 1)
+        return np.concatenate([session.run(None, {inputs[0].name: part})[0] for part in parts])
+
+    return act
 
 
 def rows_of(path: Path) -> Floats:
