@@ -156,6 +156,9 @@ def _verdict(name: str, x: Tensor, x2: Tensor, y: Tensor, near: Tensor) -> Field
     `x` are transformed outcomes, `x2` the same with other chance, `y` outcomes from the transformed states with the
     chance of `x`, `near` transformed ones from states that differ by about a rounding, with the chance of `x` too.
     """
+    own, *others, image = (side.isfinite().all(1) for side in (x, x2, near, y))
+    if share := float((torch.stack(others) == own).all(0).logical_and(image != own).float().mean()):
+        return FieldVerdict(name, "broken", share, 0.0, share=share)  # numbers on one side alone
     (x, x2, y), known = _known(x, x2, y)
     if not len(x):
         return FieldVerdict(name, "not covered", float("nan"), float("nan"))

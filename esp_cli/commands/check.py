@@ -172,24 +172,21 @@ def _check_symmetry(
     from esp_cli.checking import check_policy, check_symmetry
     from esp_cli.checking.candidates import NothingToTry
 
-    trained = None
+    measured: list[PolicyVerdict] = []
     if policy is not None:
         from esp_cli.policies.loading import open_policy
 
-        trained = open_policy(policy)
+        measured = check_policy(open_policy(policy), make_worlds, transforms)
     try:
         with console.watching("check", "elements") as watch:
             report = check_symmetry(make_worlds, transforms, watch=watch, seconds=seconds)
     except NothingToTry as told:
         spec, why = make_worlds(1, [0]).spec, str(told)
-        if trained is not None or transforms is not None or spec.symmetry != "c1" or spec.nearly:
+        if policy is not None or transforms is not None or spec.symmetry != "c1" or spec.nearly:
             raise
         said = f"{why}; the task declares no symmetry either, so all that is declared holds"
         console.result(json, {"report": None, "holds": True, "policy": []}, lambda: console.say(said))
         return 0
-    measured: list[PolicyVerdict] = []
-    if trained is not None:
-        measured = check_policy(trained, make_worlds, transforms)
     found = {"report": report, "holds": report.holds, "policy": measured}
     console.result(json, found, lambda: _print(report, measured))
     return 1 if report.broken else 2 if report.uncovered else 0
@@ -197,12 +194,12 @@ def _check_symmetry(
 
 def _print(report: SymmetryReport, measured: Sequence[PolicyVerdict]) -> None:
     print_elements(report, f"declared {report.declared}, found {report.found}")
-    if report.uncovered:
+    if unseen := [e.element for e in report.elements if e.element in report.uncovered and not e.reason]:
         missing = (
             "more episodes, or a task that can be set to a state" if report.method == "transitions" else "other states"
         )
         console.note(
-            f"declared, but not covered: {', '.join(report.uncovered)}; what was seen could not have shown a breaking "
+            f"declared, but not covered: {', '.join(unseen)}; what was seen could not have shown a breaking "
             f"of them, {missing} might"
         )
     if measured:

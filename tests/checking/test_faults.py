@@ -1,9 +1,11 @@
 """The check of symmetry finds fifty seeded faults and accuses none of fifty clean tasks."""
 
 import pytest
+import torch
+from torch import Tensor
 
 from esp_cli.checking import check_symmetry, paired
-from esp_envs import make
+from esp_envs import Observation, make
 from esp_envs.spec import discrete_moves
 from tests.benchmarks.synthetic import Recipe
 from tests.checking import faults
@@ -152,6 +154,18 @@ def test_one_state_in_a_hundred_is_a_proof_where_there_is_no_chance() -> None:
     assert worst is not None
     assert worst.field == "reward"
     assert 0 < worst.share < 0.2
+
+
+@pytest.mark.parametrize(("sides", "broken"), [(1, ["reward"]), (2, [])])
+def test_numbers_on_one_side_alone_break_a_mirror(sides: int, broken: list[str]) -> None:
+    """Where agents are to the right there is no reward; the control has none to the left either."""
+
+    def right(reward: Tensor, seen: Observation) -> Tensor:
+        place = seen.obs[..., 2]
+        return reward.masked_fill((place if sides == 1 else place.abs()) > 0.3, torch.nan)
+
+    (flip,) = check_symmetry(with_fault(*MOVES, Fault(paid=right)), "flip-y").elements
+    assert [field.field for field in flip.fields if field.outcome != "holds"] == broken
 
 
 def test_a_reward_that_never_comes_is_not_covered() -> None:

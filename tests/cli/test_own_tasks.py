@@ -9,6 +9,9 @@ from pathlib import Path
 import pytest
 
 from esp_cli import load_policy
+from esp_cli.checking import ElementVerdict, SymmetryReport
+from esp_cli.checking.verdicts import LATE, FieldVerdict
+from esp_cli.commands.check import _print
 from tests.forks import forked_esp
 from tests.own_tasks import save_page_files
 
@@ -176,6 +179,13 @@ def test_check_measures_a_policy_too(folder: Path) -> None:
     result = json.loads(esp(folder, *words).stdout)
     assert [m["element"] for m in result["policy"]] == ["rot90", "flip-x"]
     assert all(0 <= m["agreement"] <= 1 for m in result["policy"])
+
+
+def test_what_was_not_tried_is_not_said_to_have_shown_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    late = ElementVerdict("rot90", True, (), LATE)
+    blind = ElementVerdict("flip-x", True, (FieldVerdict("reward", "not covered", 0, 0),))
+    _print(SymmetryReport("calm", "paired states", "d4", "c1", "", (late, blind), {}), [])
+    assert "declared, but not covered: flip-x; what was seen could not" in " ".join(capsys.readouterr().err.split())
 
 
 def test_nothing_to_try_is_no_fault_of_a_task_that_declares_nothing(folder: Path) -> None:
