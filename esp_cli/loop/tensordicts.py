@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from itertools import count
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -46,6 +46,8 @@ def with_copies(
     device, and `roles` are of keys by their last part, where they differ from `ROLES`.
     """
     named: Mapping[str, Role] = {**ROLES, **(roles or {})}
+    if unknown := next((part for part, role in named.items() if role not in get_args(Role)), None):
+        raise UserError(f"{unknown} has the role {named[unknown]!r}; the roles are {', '.join(get_args(Role))}")
     leaves = {_path(key): value for key, value in data.items(include_nested=True, leaves_only=True)}
     data = data.exclude(*(path for path in leaves if any(named.get(part) == "drop" for part in path)))
     kept = {_path(key): value for key, value in data.items(include_nested=True, leaves_only=True)}
@@ -59,7 +61,7 @@ def with_copies(
         for path, value in kept.items():
             role = named.get(path[-1])
             if role == "trajectory":
-                moved = value + first_id  # below 0, where no trajectory of a collector is
+                moved = value.long() + first_id  # below 0, where no trajectory of a collector is
             else:
                 moved = _moved(spaces, transform, value, role, data.batch_size, ".".join(path))
             copy.set(path, moved)

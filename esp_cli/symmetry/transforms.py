@@ -143,7 +143,7 @@ class Transform:
 
     def _seeds_of(self, x: Tensor) -> int:
         """Return the size of the first axis to compute with: one element for all seeds makes seeds part of a batch."""
-        if self.num_seeds not in (1, x.shape[0]):
+        if self.num_seeds not in (1, *x.shape[:1]):
             raise UserError(f"a transform of {self.num_seeds} seeds was given data of {x.shape[0]}")
         return self.num_seeds
 

@@ -150,6 +150,21 @@ def test_a_key_of_the_role_drop_is_left_out() -> None:
     assert both["agents", "observation"].shape[0] > ROWS
 
 
+def test_a_role_that_there_is_not_is_refused() -> None:
+    with pytest.raises(ValueError, match="advantage has the role 'number'; the roles are observation, state, action"):
+        symmetry().augment_tensordict(rows(), {"advantage": "number"})
+
+
+def test_short_ids_of_trajectories_stay_apart_and_one_step_has_copies() -> None:
+    ids = torch.arange(ROWS, dtype=torch.int32)
+    own, copied = symmetry().augment_tensordict(rows().set("traj_ids", ids))["traj_ids"].split(ROWS)
+    assert torch.equal(own, ids.long())
+    assert (copied < 0).all()
+    alone = Symmetry(observation=layout(Field("velocity", Kind.VECTOR)), action=MOVES, group="rot90")
+    step = TensorDict({"observation": torch.tensor([1.0, 2.0]), "action": torch.tensor(0)}, [])
+    assert alone.augment_tensordict(step)["action"].tolist() == [0, 1], "right becomes up"
+
+
 def test_a_tensordict_without_observations_is_refused() -> None:
     with pytest.raises(ValueError, match=r"no key of the TensorDict is an observation .* it has pixels"):
         symmetry().augment_tensordict(TensorDict({"pixels": torch.zeros(ROWS, 3)}, [ROWS]))
