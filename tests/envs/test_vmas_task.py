@@ -49,6 +49,18 @@ def test_a_scenario_keeps_every_promise(name: str, settings) -> None:
     assert [f.not_asked for f in findings if f.not_asked] == [ANEW] * 2
 
 
+def test_agents_of_dispersion_fly_to_the_nearest_piece_or_each_to_its_own_until_it_is_eaten() -> None:
+    env = worlds("Dispersion", {"num_agents": 2, "n_food": 3}, num_envs=1, seeds=(0,))
+    # places and velocities of both agents at 0, then three pieces of food and which are eaten
+    state = torch.tensor([0.0] * 8 + [0.0, 0.8, 0.6, 0.8, 0.3, 0.0] + [0, 0, 0]).view(env.state_shape)
+    env.set_state(state)
+    assert env.heuristic("nearest")[0, 0].tolist() == [[1, 0], [1, 0]]
+    torch.testing.assert_close(env.heuristic()[0, 0], torch.tensor([[0, 1], [0.6, 0.8]]))
+    state[..., [14, 16]] = 1.0  # the first and the last
+    env.set_state(state)
+    torch.testing.assert_close(env.heuristic("apart")[0, 0], torch.tensor([[0.6, 0.8], [0.6, 0.8]]))
+
+
 def test_arguments_that_a_scenario_does_not_know_are_refused() -> None:
     class Careless(vmas_scenarios.Transport):
         def arguments(self):

@@ -7,7 +7,7 @@ state: it is drawn anew in each episode, and lies in wait where a check puts the
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from pydantic import Field as Setting
@@ -127,7 +127,12 @@ class DispersionSettings(VmasSettings):
 
 
 class Dispersion(VmasTask):
-    """VMAS dispersion: agents that start together in a square world disperse to pieces of food."""
+    """VMAS dispersion: agents that start together in a square world disperse to pieces of food.
+
+    Its hand-written policies fly to the "nearest" piece that is left, all together, or "apart": each to its own first.
+    """
+
+    heuristics = ("apart", "nearest")
 
     Settings: ClassVar[type[TaskSettings]] = DispersionSettings
     settings: DispersionSettings
@@ -141,6 +146,23 @@ class Dispersion(VmasTask):
     def seen(self) -> Layout:
         piece = (Field("offset", Kind.VECTOR, unit="length"), Field("eaten", Kind.SCALAR, unit="0 or 1"))
         return layout(*_OWN, Field("food", Kind.RECORD, self.settings.food, parts=piece, family="food"))
+
+    def heuristic(self, name: str | None = None) -> Tensor:
+        apart = self.named_heuristic(name) == "apart"
+        return torch.stack([self._flight(sim, apart) for sim in self._sims])
+
+    def _flight(self, sim: Any, apart: bool) -> Tensor:
+        places, food = (torch.stack([x.state.pos for x in xs], 1) for xs in (sim.agents, sim.world.landmarks))
+        eaten = torch.stack([piece.eaten for piece in sim.world.landmarks], 1).unsqueeze(1)
+        offset = food.unsqueeze(1) - places.unsqueeze(2)
+        goal = offset.norm(dim=-1).masked_fill(eaten, torch.inf).argmin(-1, keepdim=True)
+        if apart:
+            own = torch.arange(self.spec.num_agents, device=self.device).remainder(food.shape[1]).view(1, -1, 1)
+            own = own.expand_as(goal)
+            goal = torch.where(eaten.expand_as(offset[..., 0]).gather(2, own), goal, own)
+        return torch.nn.functional.normalize(
+            offset.gather(2, goal.unsqueeze(3).expand(-1, -1, -1, 2)).squeeze(2), dim=-1
+        )
 
 
 def _vectors(*names: str) -> tuple[Field, ...]:
