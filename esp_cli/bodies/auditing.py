@@ -116,10 +116,10 @@ def _called(function: Callable[..., Any], numbers: Numbers, rows: dict[str, Tens
     given, acted = (*results, None)[:2]
     try:
         told = groups if seeing else []
-        found = {group: given if isinstance(given, Tensor) and len(groups) == 1 else given[group] for group in told}
+        found = {group: given if isinstance(given, Tensor) else given[group] for group in told}
     except (KeyError, IndexError, TypeError, RuntimeError):
         found = {"": None}
-    if not all(isinstance(made, Tensor) for made in found.values()):
+    if not all(isinstance(made, Tensor) for made in found.values()) or (isinstance(given, Tensor) and len(found) > 1):
         expected = f"a tensor, or tensors by group ({', '.join(groups)})"
         raise UserError(f"the function returns {type(given).__name__} as observations; return {expected}")
     if seeing and not set(known) & set(_ACTIONS):

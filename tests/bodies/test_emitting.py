@@ -209,6 +209,12 @@ def test_functions_that_are_no_mirror_are_refused(body, function, words):
         audit(function, body, numbers_of(body, None))
 
 
+def test_one_tensor_for_several_groups_is_refused(body):
+    pytest.importorskip("tensordict")
+    with pytest.raises(UserError, match=r"returns Tensor as observations; return a tensor, or tensors by group"):
+        audit(lambda obs, actions: (obs["policy"].repeat(2, 1), actions.repeat(2, 1)), body, groups(body))
+
+
 def test_the_command_writes_audits_and_refuses(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
