@@ -41,6 +41,7 @@ class Proof:
         median: of the states' gaps: |difference| / |accelerations|.
         constraints: the same median with limits, friction and equalities.
         contacts: the same median where the robot lies on a floor; None where it cannot move freely, or touches none.
+        worst: the largest gap of a state with any of these.
         sensors: by name, the gap of a sensor's readings, turned as fits best, from those of its image, the sensor of
             its kind that fits best: a share of their own spread, without constraints.
         unjudged: kinds of sensors that are not compared: they show nothing without constraints, as those of touch, or
@@ -52,6 +53,7 @@ class Proof:
     median: float
     constraints: float
     contacts: float | None
+    worst: float
     sensors: Mapping[str, float]
     unjudged: tuple[str, ...]
 
@@ -70,15 +72,14 @@ class Proof:
         """Whether the mirror is "exact", "nearly" right, right but for "broken sensors", or "broken"."""
         if not self.gap <= NEARLY:  # nor NaN
             return "broken"
-        most = max(self.gap, self.constraints, self.contacts or 0.0, *self.sensors.values())
+        most = np.max([self.gap, self.worst, *self.sensors.values()])  # may be NaN
         return "broken sensors" if self.broken_sensors else "exact" if most <= EXACT else "nearly"
 
     @property
     def summary(self) -> dict[str, Any]:
         """The verdict and all gaps, as JSON takes them."""
-        gaps = {
-            name: getattr(self, name) for name in ("gap", "median", "constraints", "contacts", "sensors", "unjudged")
-        }
+        names = ("gap", "median", "constraints", "contacts", "worst", "sensors", "unjudged")
+        gaps = {name: getattr(self, name) for name in names}
         return {"verdict": self.verdict, **gaps, "smallest_planted": float(self.planted.min())}
 
     def would_show(self, planted: float) -> bool:
@@ -87,6 +88,8 @@ class Proof:
 
     def __str__(self) -> str:
         contact = "" if self.contacts is None else f", in contact to {self.contacts:.2g}"
+        if self.worst > EXACT >= max(self.constraints, self.contacts or 0.0):
+            contact += f", but in one state to {self.worst:.2g}"
         if worst := max(self.sensors, key=self.sensors.__getitem__, default=None):
             contact += f", sensors to {self.sensors[worst]:.2g} ({worst})"
         return (
@@ -107,7 +110,7 @@ def prove(frame: Frame, match: Match, seed: int = 0) -> Proof:
         seen = _accelerations(frame, data, _images(wrong, samples[:_PLANTED]), _NO_CONSTRAINTS | _NO_SENSORS)
         return float(_gaps(frame, wrong, here[:_PLANTED], seen)[0].max())
 
-    joints, median = _gaps(frame, match, here, there)
+    joints, free = _gaps(frame, match, here, there)
     if frame.model.neq:
         joined, tied = (_accelerations(frame, data, states, _NO_LIMITS | _NO_SENSORS) for states in (samples, images))
         joints = np.maximum(joints, _gaps(frame, match, joined, tied)[0])
@@ -119,9 +122,10 @@ def prove(frame: Frame, match: Match, seed: int = 0) -> Proof:
         for some, moved, flag in ((samples, images, _NO_CONTACTS), (lying, _images(match, lying), 0))
         if some
     ]
-    medians = [_gaps(frame, match, *pair)[1] for pair in pairs]
-    sensors = _sensors(frame.model, here, there)
-    return Proof(joints, np.array(planted), median, medians[0], medians[1] if lying else None, *sensors)
+    held = [_gaps(frame, match, *pair)[1] for pair in pairs]
+    median, *medians = (float(np.median(gaps)) for gaps in (free, *held))
+    worst, sensors = float(np.concatenate(held).max()), _sensors(frame.model, here, there)
+    return Proof(joints, np.array(planted), median, medians[0], medians[1] if lying else None, worst, *sensors)
 
 
 def _state(frame: Frame, data: Any, rng: np.random.Generator) -> Sample:
@@ -177,15 +181,15 @@ def _accelerations(frame: Frame, data: Any, samples: Sequence[Sample], disabled:
     return np.stack(found)
 
 
-def _gaps(frame: Frame, match: Match, here: Floats, there: Floats) -> tuple[Floats, float]:
-    """Return the gap of each joint, and the median of the states' gaps, of what `_accelerations` returns."""
+def _gaps(frame: Frame, match: Match, here: Floats, there: Floats) -> tuple[Floats, Floats]:
+    """Return the gap of each joint, and that of each state, of what `_accelerations` returns."""
     here, there = here[:, : frame.model.nv], there[:, : frame.model.nv]
     wanted = here @ match.qvel.T
     wrong, size = np.square(wanted - there), np.square(wanted)
     least = max(1e-12 * size.mean(), 1e-24)
     spans = [frame.dofs_of(j) for j in range(frame.model.njnt)]
     joints = np.array([np.sqrt(wrong[:, span].mean() / max(size[:, span].mean(), least)) for span in spans])
-    return joints, float(np.median(np.sqrt(wrong.sum(1) / np.maximum(size.sum(1), 1e-24))))
+    return joints, np.sqrt(wrong.sum(1) / np.maximum(size.sum(1), 1e-24))
 
 
 def _sensors(model: Any, here: Floats, there: Floats) -> tuple[dict[str, float], tuple[str, ...]]:

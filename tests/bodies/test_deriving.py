@@ -97,6 +97,16 @@ def test_shapes_that_collide_are_compared_where_masses_are_alike(shape, share):
     assert differ.share == pytest.approx(share, rel=0.01)
 
 
+@pytest.mark.parametrize("how", ['friction="5"', 'contype="0" conaffinity="0"', 'solref="0.2 1"'])
+def test_a_leg_that_touches_the_floor_otherwise_is_no_exact_mirror(how: str) -> None:
+    before, shin, behind = QUADRUPED.partition('fromto="0 0 0 0.2 0 -0.05" size="0.02"')
+    proof = body_of(f"{before}{shin} {how}{behind}").found["flip-x"].proof
+    assert proof.verdict == "nearly"
+    assert proof.contacts is not None
+    assert proof.contacts < 1e-9, "of most states it is not seen"
+    assert f"but in one state to {proof.worst:.2g}" in str(proof)
+
+
 def test_a_robot_with_one_leg_moved_has_no_mirror():
     body = body_of(biped(right_y=-0.2))
     assert (body.group, body.found) == ("c1", {})
