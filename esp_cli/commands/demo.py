@@ -55,6 +55,7 @@ def demo(
     refuse_untrainable(study)
     with StudyFolder.held(out), stop_requests("stopping both runs after their iteration") as requests:
         folder = StudyFolder.create(out, study)
+        folder.study = study.model_copy(update={"cells": tuple(folder.cells_of(study))})  # of this call alone
         resources = studying.Resources(LocalEngine(), 2, (), check=True)
         failed = studying.run_cells(folder, study, resources, requests, LiveCurves(folder))
     if requests:

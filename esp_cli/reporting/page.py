@@ -213,6 +213,8 @@ def _steps(material: Material, cell: CellResult, other: CellResult) -> list[str]
 def _count(pairs: list[tuple[CellResult, CellResult]]) -> list[str]:
     gaps = [(cell, cell.summary.gap) for cell, _ in pairs if cell.summary is not None and cell.summary.gap is not None]
     sides = Counter(gap.ahead for _, gap in gaps)
+    if set(sides) == {None}:
+        return [_verdict(*pairs[0])]
     counts = f"better {sides['ahead']}, not told apart {sides['level']}, worse {sides['behind']}"
     texts = [f"Of {len(pairs)} runs beside their reference: {counts} (95 % intervals of the difference)."]
     if gaps:

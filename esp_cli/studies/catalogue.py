@@ -125,7 +125,8 @@ def _variants(
             choice |= strength.settings
             config = _config(kind, task, algorithm, steps, request, choice)
             fields = {"task": task, "steps": steps, "algorithm": algorithm, "value": variant.removeprefix("c = ")}
-            place = tuple(part.format(**fields) for part in kind.place)
+            named = kind.place if steps in kind.steps or "{steps}" in kind.place else ()  # the paper's steps, or these
+            place = tuple(part.format(**fields) for part in named)
             yield Cell(
                 name=f"{stem}-{file_name(variant)}",
                 panel=", ".join([*heads, _paired_name(algorithm, "none"), format_exactly(steps)]),

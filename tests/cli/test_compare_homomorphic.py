@@ -65,8 +65,10 @@ def test_what_cannot_be_compared_is_refused(tmp_path: Path, options, message) ->
 
 
 def test_methods_differ_in_network_and_prior_alone() -> None:
-    study = plan("homomorphic", Request(steps=((None, 100),), seeds=(0, 1)))
-    configs = {cell.variant: cell.config for cell in study.cells}
+    study = plan("homomorphic", Request(steps=((None, 100), (None, 200_000)), seeds=(0, 1)))
+    shorter, cells = study.cells[:4], study.cells[4:]
+    assert [cell.paper for cell in shorter] == [None] * 4, "the paper's numbers are of 200k steps"
+    configs = {cell.variant: cell.config for cell in cells}
     rest = {config.model_copy(update={"network": None, "prior": None}).model_dump_json() for config in configs.values()}
     assert len(rest) == 1
     assert configs["mpn-esp"].prior.kind == "esp"
@@ -77,7 +79,7 @@ def test_methods_differ_in_network_and_prior_alone() -> None:
         "mpn-ensemble": "mpn",
     }
     assert configs["mpn-ensemble"].network.symmetrise == "c4"
-    paper = [reported(cell.paper) for cell in study.cells]
+    paper = [reported(cell.paper) for cell in cells]
     assert [number and number.mean for number in paper] == [2.1, 2.4, 2.25, None]
     turned = plan("homomorphic", Request(variants=("empn", "mpn-esp"), group="d4"))
     assert [cell.reference for cell in turned.cells] == [None, "wildlife-mappo-200k-empn"]

@@ -33,6 +33,10 @@ def test_both_learners_are_trained_drawn_and_compared_and_a_second_call_trains_n
     assert "training" not in again.stderr
     assert again.stdout == told.stdout
     assert "holds another study" in refused(*DEMO, "--out", out, "--seeds", 2)
+    longer = esp(*DEMO, "--out", out, "--steps", 200)  # beside the runs that the folder has
+    assert "film of the same 3 episodes, return MAPPO " in longer.stderr
+    assert [line.split(":")[0] for line in longer.stdout.splitlines()[:1]] == ["predator-prey, 200"]
+    assert len(longer.stdout.splitlines()) == 3
 
 
 def test_curves_are_drawn_as_wide_as_the_terminal_and_as_far_as_they_are() -> None:

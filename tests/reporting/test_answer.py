@@ -56,3 +56,12 @@ def test_of_several_runs_the_better_and_the_worse_are_counted(tmp_path: Path) ->
     assert second.startswith("The largest difference is +10.00 [")
     assert second.endswith("(both; navigation, MAPPO, 200).")
     assert "] (loss; navigation, MAPPO, 200), the smallest -10.00 [" in second
+
+
+def test_of_several_runs_of_two_seeds_nothing_is_counted(tmp_path: Path) -> None:
+    folder = StudyFolder.create(tmp_path / "s", small_study("ablate-modules", algorithms=("mappo",), seeds=(0, 1)))
+    for cell in folder.study.cells:
+        write_run(folder, cell, [[-200.0] * 2, [-150.0] * 2], [-150.0, -140.0])
+    assert answer(collect_study(folder)) == [
+        "There is no interval of the difference, so this tells nothing for sure; take three seeds or more."
+    ]

@@ -45,6 +45,14 @@ def test_another_study_in_the_same_place_is_refused(tmp_path, kind, choice):
         StudyFolder.create(tmp_path / "s", small_study(kind, **choice))
 
 
+def test_a_study_goes_on_where_a_number_of_the_paper_no_longer_compares(tmp_path):
+    study = small_study()
+    papers = [cell.model_copy(update={"paper": ("table1", "navigation", "500000", "mappo", "esp")}) for cell in study.cells]
+    StudyFolder.create(tmp_path / "s", study.model_copy(update={"cells": tuple(papers)}))
+    assert StudyFolder.create(tmp_path / "s", study).study == study
+    assert StudyFolder.open(tmp_path / "s").study == study
+
+
 def test_something_foreign_is_never_written_into(tmp_path):
     (tmp_path / "thesis.tex").write_text("mine")
     with pytest.raises(ValueError, match=r"not empty and no study \(it has 'thesis.tex'\)"):
