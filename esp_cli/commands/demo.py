@@ -17,7 +17,6 @@ from esp_cli.commands.study_progress import StudyProgress
 from esp_cli.files.formatting import format_count
 
 if TYPE_CHECKING:
-    from esp_cli.studies.run_set import Cell
     from esp_cli.studies.scheduler import Snapshot
     from esp_cli.studies.study import Study, StudyFolder
 
@@ -90,8 +89,12 @@ class LiveCurves(StudyProgress):
         self._folder, self._told = folder, 0
 
     def update(self, snapshot: Snapshot) -> None:
+        from esp_cli.studies.tuning import curve_of
+        from esp_cli.training.folder_names import METRICS
+
         super().update(snapshot)
-        curves = {cell.variant: self._points(cell) for cell in self._folder.study.cells}
+        runs = {cell.variant: self._folder.run_path(cell) / METRICS for cell in self._folder.study.cells}
+        curves = {name: [(point.step, point.mean) for point in curve_of(path)] for name, path in runs.items()}
         if self._live is not None:
             self._live.above = draw_curves(curves, self._folder.study.cells[0].config.steps, console.err.width)
             return
@@ -100,18 +103,6 @@ class LiveCurves(StudyProgress):
             returns = (f"{label} {value:.1f}" for label, (_, value) in zip(curves, points, strict=True))
             console.note(f"after {console.format_count(points[0][0])} steps: return {', '.join(returns)}")
         self._told = len(both)
-
-    def _points(self, cell: Cell) -> list[tuple[float, float]]:
-        """Return step and mean greedy return over seeds of each evaluation so far."""
-        from esp_cli.training.folder_names import METRICS
-        from esp_cli.training.metrics import NoMetricError, column, read_metrics
-
-        path = self._folder.run_path(cell) / METRICS
-        try:
-            steps, values = column(read_metrics(path) if path.exists() else [], "eval/return_greedy")
-        except NoMetricError:
-            return []
-        return list(zip(steps.tolist(), values.mean(axis=1).tolist(), strict=True))
 
 
 def _show(folder: StudyFolder) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -36,6 +37,8 @@ class TensorBoard:
     """Event files in `tensorboard/`: the mean over seeds, and a sub-folder `seed-k` for each seed's curve over it."""
 
     def __init__(self, run: TrackedRun) -> None:
+        if threading.excepthook is threading.__excepthook__:
+            threading.excepthook = _print_other_threads
         self._run = run
         self._boards: dict[int | None, Any] = {}  # SummaryWriter has no types
         self._board(None)
@@ -58,6 +61,12 @@ class TensorBoard:
             purge = self._run.first_step + 1 if self._run.first_step else 0
             self._boards[seed] = SummaryWriter(str(place), purge_step=purge, flush_secs=10)
         return self._boards[seed]
+
+
+def _print_other_threads(failed: threading.ExceptHookArgs) -> None:
+    """Print what a thread raised, unless it is one of tensorboard, whose writer raises the same to `Guarded`."""
+    if not type(failed.thread).__module__.startswith("tensorboard."):
+        threading.__excepthook__(failed)
 
 
 class WeightsAndBiases:

@@ -47,7 +47,9 @@ def test_another_study_in_the_same_place_is_refused(tmp_path, kind, choice):
 
 def test_a_study_goes_on_where_a_number_of_the_paper_no_longer_compares(tmp_path):
     study = small_study()
-    papers = [cell.model_copy(update={"paper": ("table1", "navigation", "500000", "mappo", "esp")}) for cell in study.cells]
+    papers = [
+        cell.model_copy(update={"paper": ("table1", "navigation", "500000", "mappo", "esp")}) for cell in study.cells
+    ]
     StudyFolder.create(tmp_path / "s", study.model_copy(update={"cells": tuple(papers)}))
     assert StudyFolder.create(tmp_path / "s", study).study == study
     assert StudyFolder.open(tmp_path / "s").study == study

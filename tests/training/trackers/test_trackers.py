@@ -6,6 +6,7 @@ import os
 import struct
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -219,3 +220,25 @@ def test_a_link_at_the_folder_of_a_tracker_is_not_followed(tmp_path):
     sink.close()
     assert list((tmp_path / "outside").iterdir()) == []
     assert "a link or no regular file is there" in notes[0]
+
+
+def test_a_full_disk_under_tensorboard_is_one_line_without_a_traceback(tmp_path, monkeypatch, capsys):
+    writer = pytest.importorskip("tensorboard.summary.writer.record_writer").RecordWriter
+    notes: list[str] = []
+    monkeypatch.setattr(threading, "excepthook", threading.__excepthook__)
+    (sink,) = trackers.open_trackers(["tensorboard"], trackers.TrackedRun(tmp_path, (0,), {}), notes.append)
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(writer, "write", full)
+    trackers.open_trackers(["tensorboard"], trackers.TrackedRun(tmp_path / "b", (0,), {}), notes.append)
+    assert notes == [
+        "tracking with tensorboard ended: it cannot open ([Errno 28] No space left on device); the run goes on"
+    ]
+    assert capsys.readouterr().err == ""
+    other = threading.Thread(target=full)
+    other.start()
+    other.join()
+    assert "No space left on device" in capsys.readouterr().err, "other threads are heard"
+    sink.close()
