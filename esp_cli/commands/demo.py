@@ -35,9 +35,7 @@ def demo(
     task: options.TaskOption = "predator-prey",
     steps: options.StepsOption = STEPS,
     seeds: options.SeedsOption = None,
-    out: Annotated[Path, Option("--out", "-o", help="Folder of both runs, the picture and the film.")] = Path(
-        "runs/demo"
-    ),
+    out: Annotated[Path, Option("--out", "-o", help="Folder of both runs, picture and film.")] = Path("runs/demo"),
     settings: options.SetOption = None,
 ) -> None:
     """Train MAPPO with symmetry and without it, in half a minute: two curves, a picture, and a film of both.
@@ -67,12 +65,11 @@ def _plan(task: str, steps: int, seeds: tuple[int, ...], command: str, settings:
     from esp_cli.studies.catalogue import Request, plan
 
     options.register_named([task])
-    every = {"evaluation.every_steps": max(1, steps // _EVALUATIONS)}
     request = Request(
         tasks=(task,),
         steps=((None, steps),),
         seeds=seeds,
-        overrides=every | options.parse_assignments(settings),
+        overrides={"evaluation.every_steps": max(1, steps // _EVALUATIONS)} | options.parse_assignments(settings),
         episodes=_EPISODES,
         command=command,
     )
@@ -93,8 +90,8 @@ class LiveCurves(StudyProgress):
         from esp_cli.training.folder_names import METRICS
 
         super().update(snapshot)
-        runs = {cell.variant: self._folder.run_path(cell) / METRICS for cell in self._folder.study.cells}
-        curves = {name: [(point.step, point.mean) for point in curve_of(path)] for name, path in runs.items()}
+        evaluations = {c.variant: curve_of(self._folder.run_path(c) / METRICS) for c in self._folder.study.cells}
+        curves = {name: [(one.step, one.mean) for one in points] for name, points in evaluations.items()}
         if self._live is not None:
             self._live.above = draw_curves(curves, self._folder.study.cells[0].config.steps, console.err.width)
             return
@@ -114,8 +111,7 @@ def _show(folder: StudyFolder) -> None:
     from esp_cli.training.build import build_environment
 
     material, out = collect_study(folder), folder.path
-    picture = study_figures.draw_curves(material, out / CURVES)
-    console.note(f"curves -> {picture.png}")
+    console.note(f"curves -> {study_figures.draw_curves(material, out / CURVES).png}")
     trained = [TrainedPolicy.read(folder.run_path(cell)) for cell in folder.study.cells]
     if build_environment(trained[0].config.of_one_seed(), 1, "film").has("scene"):
         request = Request(out / FILM, episodes=_FILM_EPISODES, size=_FILM_PIXELS)

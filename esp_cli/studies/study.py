@@ -97,8 +97,8 @@ class StudyFolder(RunSet):
         there = cls.open(path).study
         known = {cell.name: cell for cell in there.cells}
         again = [(cell, known[cell.name]) for cell in study.cells if cell.name in known]
-        beside = {"reference", "paper"}  # what a run is compared with may change
-        changed = [new.name for new, old in again if new != old.model_copy(update=new.model_dump(include=beside))]
+        told = {"reference", "paper"}  # what runs are compared with
+        changed = [new.name for new, old in again if new != old.model_copy(update=new.model_dump(include=told))]
         if there.kind != study.kind or there.episodes != study.episodes or changed:
             which = f" ({changed[0]} has other seeds or settings)" if changed else ""
             raise StudyError(
