@@ -91,6 +91,7 @@ def _tuning(request: Request, priors: Sequence[str], space: Path | None, trial_s
         device=request.device,
         command=request.command,
     )
+    tuning = tuning if space else tuning.around_defaults()
     tuning.check(request.seeds)
     return tuning
 

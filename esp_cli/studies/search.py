@@ -120,12 +120,8 @@ class Search(RunSet):
                 )
 
     def _defaults(self, prior: str) -> dict[str, object]:
-        config = self.tuning.config(prior, {}).model_dump(mode="json")
-        sections = {"task": "task_settings", self.tuning.algorithm: "algorithm_settings"}
-        found = {}
-        for name, dimension in self._spaces[prior].items():
-            section, _, key = name.partition(".")
-            found[name] = dimension.encoded(config[sections.get(section, section)].get(key))
+        values = self.tuning.default_values(prior, self._spaces[prior])
+        found = {name: self._spaces[prior][name].encoded(value) for name, value in values.items()}
         return {name: value for name, value in found.items() if value is not None}
 
     def _cell(self, name: str, settings: Mapping[str, object]) -> Cell:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,6 +50,18 @@ class Tuning(Strict):
         """Return a run before anything is measured for it."""
         chosen = {**self.overrides, "prior.kind": prior, **settings}
         return resolve_config(self.task, self.algorithm, self.preset, self.steps, seeds, self.device, chosen)
+
+    def default_values(self, prior: str, names: Iterable[str]) -> dict[str, JsonValue]:
+        """Return what these settings are where nothing is tried; None of one that a run does not have."""
+        config = self._asked(prior, {}, self.trial_seeds).model_dump(mode="json")
+        sections = {"task": "task_settings", self.algorithm: "algorithm_settings"}
+        places = {name: name.partition(".")[::2] for name in names}
+        return {name: config[sections.get(section, section)].get(key) for name, (section, key) in places.items()}
+
+    def around_defaults(self) -> Tuning:
+        """Return a search whose space holds the default settings too, which trial 0 then has."""
+        values = self.default_values(self.priors[0], self.space)
+        return self.model_copy(update={"space": {name: d.holding(values[name]) for name, d in self.space.items()}})
 
     def without_effect(self, prior: str) -> frozenset[str]:
         """Return the settings that change nothing with a prior, at the defaults and at each value that is checked."""

@@ -64,6 +64,16 @@ class Dimension(Strict):
         fits = value % 1 == 0 or not self.is_whole
         return value if fits and self.low <= value <= self.high else None
 
+    def holding(self, value: JsonValue) -> Dimension:
+        """Return this dimension, or one that is as much wider as it takes to hold a value of its kind."""
+        if value is None or self.encoded(value) is not None:
+            return self
+        if self.choices is not None:
+            return Dimension(choices=(value, *self.choices))
+        if not isinstance(value, int | float) or self.low is None or self.high is None or (self.log and value <= 0):
+            return self
+        return Dimension(low=min(self.low, value), high=max(self.high, value), log=self.log)
+
 
 Space = Mapping[str, Dimension]  # dotted names of settings -> what is tried of each
 

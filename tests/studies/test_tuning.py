@@ -45,6 +45,18 @@ def test_every_algorithm_has_a_space_whose_corners_are_settings_that_it_takes(al
     assert set(default_space(algorithm)) - set(without) == {"prior.consistency_coef"}
 
 
+def test_the_default_space_is_widened_to_hold_the_defaults_of_the_task():
+    given = default_space("mappo")
+    searched = tuning(task="navigation", algorithm="mappo", overrides={}, space=given).around_defaults()
+    values = searched.default_values("esp", given)
+    assert (given["mappo.learning_rate"].high, values["mappo.learning_rate"]) == (3e-3, 4e-3)
+    assert searched.space["mappo.learning_rate"] == Dimension(low=1e-4, high=4e-3, log=True)
+    assert searched.space["network.hidden"].choices == ([64], [64, 64], [128, 128])
+    assert searched.space["mappo.entropy_coef"] == given["mappo.entropy_coef"]
+    assert all(searched.space[name].encoded(value) is not None for name, value in values.items())
+    assert Dimension(low=0.1, high=1.0, log=True).holding(0.0).low == 0.1, "no logarithm"
+
+
 def test_an_algorithm_without_a_space_asks_for_one():
     with pytest.raises(ValueError, match="mine has no default space; name the settings to tune with --space FILE"):
         default_space("mine")
