@@ -70,10 +70,11 @@ def draw(found: dict[str, dict[str, dict]], path: Path) -> None:
         for k, (name, run) in enumerate(runs.items()):
             returns = np.array(run["returns"])
             mean, half = returns.mean(1), 1.96 * returns.std(1, ddof=1) / returns.shape[1] ** 0.5
-            (line,) = above.plot(run["steps"], mean, label=name)
-            above.fill_between(run["steps"], mean - half, mean + half, alpha=0.2)
+            steps = np.array(run["steps"]) / 1000
+            (line,) = above.plot(steps, mean, label=name)
+            above.fill_between(steps, mean - half, mean + half, alpha=0.2)
             below.plot(run["difference"], [k] * len(run["difference"]), "o", color=line.get_color())
-        above.set(title=task, xlabel="environment steps per seed", ylabel="greedy return")
+        above.set(title=task, xlabel="thousand environment steps per seed", ylabel="greedy return")
         above.legend()
         below.set(yticks=range(len(runs)), yticklabels=list(runs), xlabel="left-right difference of the gait")
     figure.savefig(path, dpi=150)
