@@ -53,7 +53,7 @@ class Tuning(Strict):
 
     def default_values(self, prior: str, names: Iterable[str]) -> dict[str, JsonValue]:
         """Return what these settings are where nothing is tried; None of one that a run does not have."""
-        config = self._asked(prior, {}, self.trial_seeds).model_dump(mode="json")
+        config = self.config(prior, {}).model_dump(mode="json")
         sections = {"task": "task_settings", self.algorithm: "algorithm_settings"}
         places = {name: name.partition(".")[::2] for name in names}
         return {name: config[sections.get(section, section)].get(key) for name, (section, key) in places.items()}

@@ -67,7 +67,11 @@ def measured(path: Path) -> dict[str, object]:
 def draw(found: dict[str, dict[str, dict]], path: Path) -> None:
     figure, axes = plt.subplots(2, len(found), figsize=(4 * len(found), 6), squeeze=False, layout="constrained")
     for (task, runs), (above, below) in zip(found.items(), axes.T, strict=True):
-        for k, (name, run) in enumerate(runs.items()):
+        names = [
+            ("without" if run["prior"] == "none" else "with the prior") + ", tuned" * ("tuned" in name)
+            for name, run in runs.items()
+        ]
+        for k, (name, run) in enumerate(zip(names, runs.values(), strict=True)):
             returns = np.array(run["returns"])
             mean, half = returns.mean(1), 1.96 * returns.std(1, ddof=1) / returns.shape[1] ** 0.5
             steps = np.array(run["steps"]) / 1000
@@ -76,7 +80,7 @@ def draw(found: dict[str, dict[str, dict]], path: Path) -> None:
             below.plot(run["difference"], [k] * len(run["difference"]), "o", color=line.get_color())
         above.set(title=task, xlabel="thousand environment steps per seed", ylabel="greedy return")
         above.legend()
-        below.set(yticks=range(len(runs)), yticklabels=list(runs), xlabel="left-right difference of the gait")
+        below.set(yticks=range(len(runs)), yticklabels=names, xlabel="left-right difference of the gait")
     figure.savefig(path, dpi=150)
 
 

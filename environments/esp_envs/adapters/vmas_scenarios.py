@@ -155,14 +155,12 @@ class Dispersion(VmasTask):
         places, food = (torch.stack([x.state.pos for x in xs], 1) for xs in (sim.agents, sim.world.landmarks))
         eaten = torch.stack([piece.eaten for piece in sim.world.landmarks], 1).unsqueeze(1)
         offset = food.unsqueeze(1) - places.unsqueeze(2)
-        goal = offset.norm(dim=-1).masked_fill(eaten, torch.inf).argmin(-1, keepdim=True)
+        distance = offset.norm(dim=-1)
         if apart:
-            own = torch.arange(self.spec.num_agents, device=self.device).remainder(food.shape[1]).view(1, -1, 1)
-            own = own.expand_as(goal)
-            goal = torch.where(eaten.expand_as(offset[..., 0]).gather(2, own), goal, own)
-        return torch.nn.functional.normalize(
-            offset.gather(2, goal.unsqueeze(3).expand(-1, -1, -1, 2)).squeeze(2), dim=-1
-        )
+            agents = torch.arange(distance.shape[1])
+            distance[:, agents, agents % distance.shape[2]] = -1.0
+        goal = distance.masked_fill(eaten, torch.inf).argmin(-1)
+        return torch.nn.functional.normalize(offset.take_along_dim(goal[..., None, None], 2).squeeze(2), dim=-1)
 
 
 def _vectors(*names: str) -> tuple[Field, ...]:
