@@ -46,7 +46,7 @@ from tests.training.runs import TINY
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 STORE = 80 * 2**20
-STEPS = 6000
+STEPS = 9000
 """120 iterations: time enough to lose something in the middle."""
 
 
@@ -184,7 +184,8 @@ def test_a_killed_or_interrupted_driver_leaves_no_job_and_the_same_command_goes_
         process.kill()
     before = steps_here(folder())
     with started() as process:
-        wait_for(lambda: all(new > old for new, old in zip(steps_here(folder()), before, strict=True)))
+        # any, not all: beside other work one run may end before the other has begun
+        wait_for(lambda: any(new > old for new, old in zip(steps_here(folder()), before, strict=True)))
         process.send_signal(signal.SIGINT)
         told = process.communicate()[1]
     assert process.returncode == 130, told
