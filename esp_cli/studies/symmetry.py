@@ -1,4 +1,7 @@
-"""The benchmark of symmetry: each method tuned on equal steps on each task, then judged by seeds that no trial had."""
+"""The benchmark of symmetry: each method tuned on equal steps on each task, then judged by seeds that no trial had.
+
+One learner at a time, MAPPO unless another is asked for.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +61,7 @@ class Board:
     task: str  # its name
     settings: Settings = field(default_factory=dict)  # of every run, over those of the preset
     trial_steps: int = 60_000  # environment steps per seed of a trial
-    steps: int = 200_000  # of the runs that judge
+    steps: int = 200_000  # of the runs of MAPPO that judge; those of other learners are as long as trials
     preset: str = "default"
     networks: tuple[str, str] = ("mlp", "equivariant")  # plain, and homomorphic
     batches: bool = False  # whether horizon and batch are tuned too; their space is that of particle tasks
@@ -92,26 +95,46 @@ TASKS: Mapping[str, Board] = {
 }
 """By the name that the tables have; other tasks stand for themselves."""
 
-SPACE: Mapping[str, tuple[object, ...]] = {
-    "mappo.learning_rate": (1e-3, 2e-3, 4e-3, 8e-3),
-    "mappo.entropy_coef": (0.001, 0.003, 0.01, 0.03),
-    "mappo.gamma": (0.9, 0.95, 0.98, 0.99),
-    "mappo.gae_lambda": (0.8, 0.9, 0.95),
-    "mappo.num_epochs": (3, 5, 8),
-    "mappo.num_minibatches": (2, 5, 10),
-    "mappo.num_envs": (64, 128),
-    "prior.consistency_coef": (0.03, 0.1, 0.3, 1.0),
+Space = Mapping[str, tuple[object, ...]]
+_OFF_POLICY: Space = {
+    "learning_rate": (1e-3, 2e-3, 4e-3, 1e-2),
+    "gamma": (0.9, 0.95, 0.98, 0.99),
+    "td_lambda": (0.3, 0.6, 0.8, 0.9),
+    "updates_per_episode": (1, 2),
+    "num_envs": (4, 8),
+    "epsilon_steps": (5_000, 10_000, 20_000, 50_000),
 }
-_OF_NETWORKS: Mapping[str, tuple[object, ...]] = {"network.relax": (0.1, 0.3, 1.0, 3.0)}
-_OF_BATCHES = frozenset({"mappo.gamma", "mappo.num_minibatches", "mappo.num_envs"})
+SPACES: Mapping[str, Space] = {
+    "mappo": {
+        "learning_rate": (1e-3, 2e-3, 4e-3, 8e-3),
+        "entropy_coef": (0.001, 0.003, 0.01, 0.03),
+        "gamma": (0.9, 0.95, 0.98, 0.99),
+        "gae_lambda": (0.8, 0.9, 0.95),
+        "num_epochs": (3, 5, 8),
+        "num_minibatches": (2, 5, 10),
+        "num_envs": (64, 128),
+    },
+    "maddpg": {
+        **_OFF_POLICY,
+        "actor_learning_rate": (1e-3, 2e-3, 4e-3, 1e-2),
+        "tau": (0.005, 0.01, 0.03),
+        "output_penalty": (1e-4, 1e-3, 1e-2),
+    },
+    "qmix": {**_OFF_POLICY, "target_every": (25, 50, 100, 200), "replay_episodes": (500, 1000, 5000)},
+}
+"""What is tried of each learner's settings."""
+_COEFFICIENT: Space = {"prior.consistency_coef": (0.03, 0.1, 0.3, 1.0)}
+_OF_NETWORKS: Space = {"network.relax": (0.1, 0.3, 1.0, 3.0)}
+_OF_BATCHES = ("gamma", "num_minibatches", "num_envs")
 TRIAL_SEEDS = (100, 101, 102)
 _SCORED = 2  # greedy evaluations at the end of a trial whose mean is its score
 
 
-def draws(count: int) -> list[dict[str, object]]:
-    """Return the settings to try, the same for every method and task: none but the preset's, then drawn ones."""
+def draws(algorithm: str, count: int) -> list[dict[str, object]]:
+    """Return a learner's settings to try, the same for every method and task: the preset's own, then drawn ones."""
     found: list[dict[str, object]] = [{} for _ in range(count)]
-    for seed, space in enumerate((SPACE, _OF_NETWORKS)):
+    own = {f"{algorithm}.{name}": values for name, values in SPACES[algorithm].items()}
+    for seed, space in enumerate(({**own, **_COEFFICIENT}, _OF_NETWORKS)):
         generator = random.Random(seed)
         for one in found[1:]:
             one.update((name, generator.choice(values)) for name, values in space.items())
@@ -153,6 +176,9 @@ class Benchmark:
         self.request, self.budget = request, budget
         self.methods = tuple(METHODS if request.variants is None else request.variants)
         self.boards = {name: TASKS.get(name) or Board(name) for name in request.tasks or TASKS}
+        self.algorithm, *others = request.algorithms or ("mappo",)
+        if others or self.algorithm not in SPACES:
+            raise UserError(f"this benchmark tunes one learner, whose space it has; --algo {', '.join(SPACES)}")
         self._refuse_wrong()
         self.left_out: dict[str, str] = {}
         for board in self.boards.values():
@@ -168,8 +194,6 @@ class Benchmark:
             if name not in METHODS or self.methods.count(name) > 1:
                 fault = "is named twice" if name in METHODS else "is no method"
                 raise UserError(f"'{name}' {fault}; name each once: {', '.join(map(repr, METHODS))}")
-        if (self.request.algorithms or ("mappo",)) != ("mappo",):
-            raise UserError("this benchmark trains mappo alone, whose settings it tunes; leave --algo out")
         if shared := set(self.request.seeds) & set(TRIAL_SEEDS):
             raise UserError(f"seed {min(shared)} belongs to the trials; choose seeds that no trial has")
         own = {name for method in self.methods for name in METHODS[method]}
@@ -201,34 +225,39 @@ class Benchmark:
         own = [steps for task, steps in asked if task == name] or [steps for task, steps in asked if task is None]
         if len(own) > 1:
             raise UserError(f"--steps gives {name} several numbers; this study takes one for each task")
+        if self.algorithm != "mappo":  # so their trials are as long as what judges
+            return own[0] if own else board.trial_steps
         steps = own[0] if own else board.steps
         return max(1, steps * board.trial_steps // board.steps) if trial else steps
 
     def config(self, name: str, method: str, draw: int, trial: bool) -> RunConfig:
         """Return the run of a method on a task with the settings of a draw."""
-        board, request = self.boards[name], self.request
-        preset = board.preset if request.preset == "default" else request.preset
+        board, request, algorithm = self.boards[name], self.request, self.algorithm
+        preset = board.preset if (request.preset, algorithm) == ("default", "mappo") else request.preset
         networks = dict(zip((PERCEPTRON, HOMOMORPHIC), board.networks, strict=True))
         own = {key: networks.get(str(value), value) for key, value in METHODS[method].items()}
+        own = {key: value for key, value in own.items() if concerns(key, board.task, algorithm)}
         given = {
             task_setting(key, board.task): value
             for key, value in request.overrides.items()
-            if concerns(key, board.task, "mappo")
+            if concerns(key, board.task, algorithm)
         }
         idle = {f"prior.{key}" for key in of_no_use_to(str(own["prior.kind"]))}
-        idle |= (_OF_NETWORKS.keys() - own.keys()) | given.keys() | (frozenset() if board.batches else _OF_BATCHES)
-        drawn = {key: value for key, value in draws(self.budget)[draw].items() if key not in idle}
+        idle |= (_OF_NETWORKS.keys() - own.keys()) | given.keys()
+        idle |= set() if board.batches else {f"{algorithm}.{key}" for key in _OF_BATCHES}
+        drawn = {key: value for key, value in draws(algorithm, self.budget)[draw].items() if key not in idle}
         steps, seeds = self.steps(name, trial), TRIAL_SEEDS if trial else request.seeds
         settings = {**board.settings, **own, **drawn, **given}
-        return planned(resolve_config(board.task, "mappo", preset, steps, seeds, request.device, settings))
+        return planned(resolve_config(board.task, algorithm, preset, steps, seeds, request.device, settings))
 
     def _cell(self, name: str, method: str, draw: int, trial: bool) -> Cell:
         first = next(other for task, other in self.taken if task == name)
-        stem = f"{file_name(name)}-{format_exactly(self.steps(name, trial=False))}"
+        learner = () if self.algorithm == "mappo" else (self.algorithm,)
+        stem = "-".join((file_name(name), format_exactly(self.steps(name, trial=False)), *learner))
         own = f"{stem}-{file_name(method)}"
         return Cell(
             name=f"{own}-{draw}" if trial else own,
-            panel=f"{name}, {format_exactly(self.steps(name, trial))}",
+            panel=", ".join((name, *map(str.upper, learner), format_exactly(self.steps(name, trial)))),
             variant=f"{method}, draw {draw}" if trial else method,
             config=self.config(name, method, draw, trial),
             reference=None if trial or method == first else f"{stem}-{file_name(first)}",
@@ -252,7 +281,7 @@ class Benchmark:
             own = of_trials[k * size : (k + 1) * size]
             scores[f"{name}: {method}"] = [value if math.isfinite(value) else None for value in own]
             cells.append(self._cell(name, method, int(np.argmax(own)), trial=False))
-        document = {"draws": draws(size), "seeds": TRIAL_SEEDS, "scores": scores}
+        document = {"draws": draws(self.algorithm, size), "seeds": TRIAL_SEEDS, "scores": scores}
         replace_file(trials.path / "trials.json", (json.dumps(document, indent=1) + "\n").encode())
         title = "Symmetry in multi-agent learning, each method tuned on equal steps"
         return self._study("symmetry", title, tuple(cells))

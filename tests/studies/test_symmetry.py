@@ -39,10 +39,10 @@ def write_trials(path: Path, asked: Benchmark, ends: dict[str, float]) -> Trials
 
 def test_the_draws_are_those_of_the_comparison_on_file() -> None:
     """So its protocol is that of docs/many-agents.md; the weight of relaxation, which that has not, comes after."""
-    ours = [{name: value for name, value in one.items() if name != "network.relax"} for one in draws(5)]
+    ours = [{name: value for name, value in one.items() if name != "network.relax"} for one in draws("mappo", 5)]
     assert ours == json.loads(MEASURED.read_text())["draws"]
-    assert draws(2) == draws(5)[:2]
-    assert {one["network.relax"] for one in draws(20)[1:]} == {0.1, 0.3, 1.0, 3.0}
+    assert draws("mappo", 2) == draws("mappo", 5)[:2]
+    assert {one["network.relax"] for one in draws("mappo", 20)[1:]} == {0.1, 0.3, 1.0, 3.0}
 
 
 def test_the_score_is_the_mean_of_the_last_two_evaluations(tmp_path: Path) -> None:
@@ -125,7 +125,8 @@ def test_what_is_judged_gets_no_further_trials_but_other_methods_do(tmp_path: Pa
     [
         ({"variants": ("plain", "magic")}, "'magic' is no method; name each once: 'plain', 'ESP', "),
         ({"variants": ("plain", "plain")}, "'plain' is named twice"),
-        ({"algorithms": ("qmix",)}, "this benchmark trains mappo alone"),
+        ({"algorithms": ("mappo", "qmix")}, "this benchmark tunes one learner, whose space it has"),
+        ({"algorithms": ("reinforce",)}, "this benchmark tunes one learner, whose space it has"),
         ({"seeds": (0, 101)}, "seed 101 belongs to the trials"),
         ({"overrides": {"prior.kind": "esp"}}, "--set prior.kind is what this study varies by itself"),
         (
@@ -165,3 +166,17 @@ def test_the_report_corrects_for_the_number_of_methods(tmp_path: Path) -> None:
     assert (row["over all pairs>"], row["p, corrected>"]) == ("1.00", "0.057")
     alone = material.results.model_copy(update={"cells": material.results.cells[:2]})
     assert summarised(alone).cells[1].summary.gap.ahead == "ahead", "2 / 70 is below 5 %"
+
+
+def test_another_learner_has_its_own_space_and_trials_as_long_as_what_judges() -> None:
+    asked = benchmark(algorithms=("maddpg",), variants=("plain", "ESP", "sets"), budget=2)
+    plain, esp = (asked.config("navigation", method, 1, trial=True) for method in ("plain", "ESP"))
+    drawn = {name.removeprefix("maddpg."): x for name, x in draws("maddpg", 2)[1].items() if "maddpg." in name}
+    assert len(drawn) == 9
+    for config in (plain, esp):
+        assert {name: config.algorithm_settings[name] for name in drawn} == drawn
+    assert (plain.prior.kind, esp.prior.kind) == ("none", "esp")
+    assert (plain.preset, plain.steps) == ("default", 60_000) == (esp.preset, asked.steps("navigation", trial=False))
+    assert asked.config("navigation", "sets", 0, trial=True).network.name == "set"
+    cell = asked.trials.cells[0]
+    assert (cell.name, cell.panel) == ("navigation-60k-maddpg-plain-0", "navigation, MADDPG, 60k")
