@@ -128,6 +128,10 @@ def put_back(env: Environment, observation: Observation) -> None:
     restore_generators(env.generators, states)
 
 
+BLIND = "blind"
+"""Name of a heuristic that sees nothing of what a task is about; no verdict compares two policies below it."""
+
+
 class Environment(ABC):
     """A batch of worlds of one task.
 

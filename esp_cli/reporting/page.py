@@ -146,7 +146,12 @@ def _fenced(command: str) -> str:
     return f"{fence}sh\n{command}\n{fence}"
 
 
-_VERDICTS: dict[Side, str] = {"ahead": "is better than", "behind": "is worse than", "level": "is not told apart from"}
+_VERDICTS: dict[Side, str] = {
+    "ahead": "is better than",
+    "behind": "is worse than",
+    "level": "is not told apart from",
+    "blind": "is below a policy that sees nothing, as is",
+}
 _SCALE = "where 0 is the random policy and 1 the best hand-written one"
 
 
@@ -216,6 +221,7 @@ def _count(pairs: list[tuple[CellResult, CellResult]]) -> list[str]:
     if set(sides) == {None}:
         return [_verdict(*pairs[0])]
     counts = f"better {sides['ahead']}, not told apart {sides['level']}, worse {sides['behind']}"
+    counts += f", both below a policy that sees nothing {sides['blind']}" if sides["blind"] else ""
     texts = [f"Of {len(pairs)} runs beside their reference: {counts} (95 % intervals of the difference)."]
     if gaps:
         ordered = sorted(gaps, key=lambda pair: pair[1].difference.value)

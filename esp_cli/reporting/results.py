@@ -33,10 +33,11 @@ from esp_cli.policies.statistics import (
 )
 from esp_cli.studies.kinds import kind_of
 from esp_cli.studies.paper import NUM_SEEDS
+from esp_envs.base import BLIND
 
 RESULTS_FORMAT = DocumentFormat("esp-results", 1, "the results of a study")
 Numbers = tuple[float | None, ...]  # one number per seed; None where the seed stopped
-Side = Literal["ahead", "behind", "level"]
+Side = Literal["ahead", "behind", "level", "blind"]  # blind: both are below the policy that sees nothing
 MIN_SEEDS_TO_RANK = 3  # of either side; a probability of improvement of fewer seeds says nothing
 
 
@@ -187,7 +188,11 @@ def _gap(results: Results, cell: CellResult, values: Floats) -> Gap | None:
     if min(values.size, others.size) >= MIN_SEEDS_TO_RANK:
         of_all = probability_of_improvement(values, others)
         chance = probability_of_improvement(values, others, paired=True) if paired else of_all
-    return Gap(gained, paired, chance, of_all, None if of_all is None else side_of(gained.ci95))
+    side = None if of_all is None else side_of(gained.ci95)
+    floor = cell.anchors.get(BLIND, -math.inf)
+    if side is not None and max(values.mean(), others.mean()) < floor:
+        side = "blind"
+    return Gap(gained, paired, chance, of_all, side)
 
 
 def _corrected(results: Results, cells: tuple[CellResult, ...]) -> tuple[CellResult, ...]:
@@ -204,6 +209,7 @@ def _corrected(results: Results, cells: tuple[CellResult, ...]) -> tuple[CellRes
         for (name, (summary, gap, _)), p in zip(own.items(), corrected, strict=True):
             better = gap.over_all_pairs is not None and gap.over_all_pairs.value > 1 / 2
             side: Side = "level" if p > 1 - CONFIDENCE else "ahead" if better else "behind"
+            side = "blind" if gap.ahead == "blind" else side
             changed[name] = replace(summary, gap=replace(gap, ahead=side, holm=p))
     return tuple(c.model_copy(update={"summary": changed[c.name]}) if c.name in changed else c for c in cells)
 

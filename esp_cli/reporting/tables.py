@@ -16,7 +16,7 @@ from esp_cli.reporting.results import CellResult, CellSummary, Gap, Results, flo
 from esp_cli.studies.kinds import kind_of
 
 NOT_RUN, _STOPPED = "not run", "every seed stopped"
-AHEAD = {"ahead": "yes", "behind": "no", "level": "not told apart", None: NOTHING}
+AHEAD = {"ahead": "yes", "behind": "no", "level": "not told apart", "blind": "both below blind", None: NOTHING}
 _LEADER = {"first": "ours", "second": "paper", "neither": "not told apart", None: NOTHING}
 _MARKUP = re.compile(r"[\\`*<|]|\](?=\()")
 _BY_INTERVALS = "Ahead: the 95 % interval of the difference lies above 0."

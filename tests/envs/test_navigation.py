@@ -132,11 +132,26 @@ def test_cover_stands_between_two_landmarks() -> None:
 
 
 def test_cover_is_left_out_where_it_cannot_enumerate() -> None:
-    assert make("navigation", 1, [0], {"num_agents": 4, "num_landmarks": 6}).heuristics == ("nearest", "cover")
+    assert make("navigation", 1, [0], {"num_agents": 4, "num_landmarks": 6}).heuristics == ("nearest", "cover", "blind")
     env = make("navigation", 1, [0], {"num_agents": 4, "num_landmarks": 7})
     env.reset()
     with pytest.raises(ValueError, match="has no heuristic 'cover'; it has nearest"):
         env.heuristic("cover")
+
+
+def test_the_blind_share_out_fixed_places_whatever_the_landmarks_are() -> None:
+    torch.testing.assert_close(covering.places(1), torch.zeros(1, 2), atol=1e-3, rtol=0)
+    quarters = {(round(float(x), 2), round(float(y), 2)) for x, y in covering.places(4)}
+    assert quarters == {(x, y) for x in (-0.5, 0.5) for y in (-0.5, 0.5)}, "the middle of each quarter"
+    env = make("navigation", 2, [0], {"num_agents": 4})
+    env.reset()
+    agents = torch.tensor([[0.0, 0, 0, 0, 0, 0, 0, 0, 0.7, 0.4, -0.4, 0.7, -0.7, -0.4, 0.4, -0.7]])
+    states = torch.stack([torch.cat([agents, torch.full((1, 8), place)], 1) for place in (0.1, -0.8)], 1)
+    env.set_state(states)
+    # from (0.7, 0.4) to 0.8 (0.5, 0.5) = (0.4, 0.4): left; and each other by a quarter turn on: down, right, up
+    assert env.heuristic("blind").tolist() == [[[1, 3, 2, 4]] * 2]
+    assert not torch.equal(*env.heuristic("nearest")[0])
+    assert make("navigation", 1, [0], {"num_agents": 40, "sees": 3}).heuristics == ("nearest",)
 
 
 def test_the_former_name_of_a_heuristic_still_names_it() -> None:

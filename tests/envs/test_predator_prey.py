@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from esp_envs import Items, make
-from esp_envs.mpe.predator_prey import chase, flee, out_of_bounds
+from esp_envs.mpe.predator_prey import chase, circle, flee, out_of_bounds
 from esp_envs.mpe.task import nearest_move
 from tests.envs.playing import episode_return
 
@@ -155,3 +155,18 @@ def test_anchors(settings: dict[str, object], policy: str, expected: float) -> N
 def test_settings_that_contradict_each_other_are_refused(settings: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="PredatorPreySettings"):
         make("predator-prey", 1, [0], settings)
+
+
+def test_the_blind_circle_whatever_the_prey_does() -> None:
+    # at the radius of the circle, 0.3, an agent on the x axis goes up; inside of it outwards
+    predators = torch.tensor([[[0.3], [0.0]], [[0.0], [0.1]]])
+    torch.testing.assert_close(circle(predators, 0.3)[..., 0], torch.tensor([[0.0, 1.0], [-1.0, 2.0]]))
+    env = make("predator-prey", 2, [0], {"prey": "still"})
+    rows = torch.zeros(1, 2, env.spec.state.width)
+    place = env.spec.state.slices()
+    rows[..., place["position"]] = torch.tensor([0.3, 0.0, -0.3, 0.0, 0.0, 0.3])
+    rows[0, :, place["prey_position"]] = torch.tensor([[0.8, 0.8], [-0.8, 0.1]])
+    env.reset()
+    env.set_state(rows)
+    assert env.heuristic("blind").tolist() == [[[4, 3, 1]] * 2], "up, down, left"
+    assert make("predator-prey", 1, [0], {"control": "prey"}).heuristics == ("chase",)

@@ -120,6 +120,15 @@ def test_ahead_and_behind_are_on_either_side_of_0(tmp_path):
         assert column(found, "comparison", "ahead of reference") == ["", word]
 
 
+def test_there_is_no_verdict_between_two_runs_below_the_policy_that_sees_nothing(tmp_path):
+    ends = {"MAPPO": PLAIN, "MAPPO-ESP": [x + 5 + k for k, x in enumerate(PLAIN)]}
+    found = collect_study(write_study(tmp_path / "s", small_study(), ends)).results
+    for blind, word in ((max(ends["MAPPO-ESP"]), "both below blind"), (sum(PLAIN) / len(PLAIN), "yes")):
+        cells = tuple(c.model_copy(update={"anchors": {**c.anchors, "blind": blind}}) for c in found.cells)
+        judged = summarised(found.model_copy(update={"cells": cells}))
+        assert column(judged, "comparison", "ahead of reference") == ["", word]
+
+
 def test_the_paper_stands_beside_a_cell_and_is_compared_by_the_errors_of_both(tmp_path):
     ends = {"MAPPO": [-133.0, -132.0, -131.0], "MAPPO-ESP": [-100.0, -101.0, -102.0]}
     found = collect_study(write_study(tmp_path / "s", small_study(steps=((None, 500_000),)), ends)).results

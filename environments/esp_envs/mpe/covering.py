@@ -6,12 +6,14 @@ Everything works on all worlds at once, with the worlds on the last axis W.
 from __future__ import annotations
 
 import itertools
+from functools import cache
 
 import torch
 from torch import Tensor
 
 LOOKAHEAD_S = 0.2  # for which the present velocity carries an agent on; found by search, it brakes in time
 FULL_FORCE_DISTANCE = 0.2  # that a step of full force makes in all (0.5 length/s, less by a quarter a step, 0.1 s)
+_STARTS, _WEISZFELD_STEPS = 16, 60  # of `places`
 MAX_SHARINGS = 4096  # most ways of sharing out landmarks that `shared_out` should try
 MOST_ASSIGNED = 2000  # agents or landmarks that `assigned` shares out by the Hungarian method, whose time is cubic
 TRAVEL_WEIGHT = 0.25  # of the distance to travel against that which remains, in `shared_out`; found by search
@@ -20,6 +22,23 @@ TRAVEL_WEIGHT = 0.25  # of the distance to travel against that which remains, in
 def approach(goal: Tensor, position: Tensor, velocity: Tensor) -> Tensor:
     """Return the force that each agent wishes for [N, 2, W] to come to rest at its goal."""
     return (goal - position - LOOKAHEAD_S * velocity) / FULL_FORCE_DISTANCE
+
+
+@cache
+def places(count: int) -> Tensor:
+    """Return the places [K, 2] from which the nearest is least far, in the mean, from a point of [-1, 1]^2.
+
+    Weiszfeld's steps, each place towards the points nearest to it; the best of some random starts.
+    """
+    side = torch.linspace(-0.975, 0.975, 40)
+    points = torch.cartesian_prod(side, side)
+    generator = torch.Generator().manual_seed(0)
+    found = torch.rand(_STARTS, count, 2, generator=generator) * 2 - 1
+    for _ in range(_WEISZFELD_STEPS):
+        distance = torch.cdist(points, found).clamp_min(1e-6)
+        own = torch.nn.functional.one_hot(distance.argmin(2), count) / distance
+        found = (own.transpose(1, 2) @ points) / own.sum(1).clamp_min(1e-6).unsqueeze(-1)
+    return found[torch.cdist(points, found).amin(2).mean(1).argmin()]
 
 
 def one_each(position: Tensor, landmark: Tensor) -> Tensor:

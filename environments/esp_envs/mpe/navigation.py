@@ -11,6 +11,7 @@ import torch
 from pydantic import Field as Setting
 from torch import Tensor
 
+from esp_envs.base import BLIND
 from esp_envs.batched import World
 from esp_envs.mpe import covering
 from esp_envs.mpe.many import ManyWorlds
@@ -114,9 +115,10 @@ class Navigation(ParticleTask):
     landmarks) `flip-x`.
 
     Heuristics: `nearest` (each agent takes a landmark of its own, above 8 agents by the Hungarian method), `cover`
-    (agents share out all landmarks between them, for L > N; where there are at most 4096 ways, N^L, to do so).
+    (agents share out all landmarks between them, for L > N; where there are at most 4096 ways, N^L, to do so), `blind`
+    (sees no landmark: agents share out the places from which the nearest is least far in the mean; without `sees`).
 
-    Anchors, `esp` convention, N = L = 3, return of one agent per episode: random -218, nearest -112,
+    Anchors, `esp` convention, N = L = 3, return of one agent per episode: random -218, blind -166, nearest -112,
     cover -109.
 
     Versions:
@@ -124,14 +126,14 @@ class Navigation(ParticleTask):
     """
 
     Settings: ClassVar[type[NavigationSettings]] = NavigationSettings
-    heuristics: tuple[str, ...] = ("nearest", "cover")
+    heuristics: tuple[str, ...] = ("nearest", "cover", BLIND)
     settings: NavigationSettings
 
     def __init__(self, settings: NavigationSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
         super().__init__(settings, num_envs, generators)
         agents, landmarks = settings.num_agents, settings.landmarks
-        if landmarks * math.log(agents) > math.log(covering.MAX_SHARINGS):
-            self.heuristics = ("nearest",)
+        shared = () if landmarks * math.log(agents) > math.log(covering.MAX_SHARINGS) else ("cover",)
+        self.heuristics = ("nearest", *shared, *(() if settings.many else (BLIND,)))
 
     def _describe(self) -> TaskSpec:
         settings = self.settings
@@ -182,11 +184,14 @@ class Navigation(ParticleTask):
         return torch.cat([world["velocity"], position, *self._ways(position, world["landmarks"])], -1)
 
     def heuristic(self, name: str | None = None) -> Tensor:
-        """Return the joint action of `nearest` (default) or `cover`."""
-        worlds, agents = self.worlds, self.settings.num_agents
+        """Return the joint action of `nearest` (default), `cover` or `blind`."""
+        worlds, agents, name = self.worlds, self.settings.num_agents, self.named_heuristic(name)
         position, landmark = worlds.position, worlds.entity[agents:] + self._shift
+        if name == BLIND:
+            places = covering.places(agents).to(self.device) * self.settings.extent
+            landmark = places.unsqueeze(-1).expand(-1, -1, position.shape[-1]) + self._shift
         one_each = covering.assigned if self.settings.many else covering.one_each
-        assign = one_each if self.named_heuristic(name) == "nearest" else covering.shared_out
+        assign = covering.shared_out if name == "cover" else one_each
         goal = assign(position, landmark)
         return self._to_action(covering.approach(goal, position, worlds.velocity))
 

@@ -10,7 +10,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from esp_envs.base import joined
+from esp_envs.base import BLIND, joined
 from esp_envs.batched import World
 from esp_envs.mpe.particles import Bodies
 from esp_envs.mpe.predator_prey_spec import PredatorPreySettings, predator_prey_spec
@@ -29,6 +29,7 @@ URGENCY = 10.0  # full force beyond 1 / URGENCY lengths of aiming error
 BOUND = 0.9  # the fleeing prey heads for the origin when farther from it than this (lengths)
 _FAR = 1e3
 _TINY = 1e-12
+BLIND_RADIUS = 0.3  # of the circle of `blind`, in halves of the square; the best of 0, 0.3, 0.5 and 0.7
 
 
 class PredatorPrey(ParticleTask):
@@ -86,9 +87,10 @@ class PredatorPrey(ParticleTask):
     symmetry leave: `wind` and `mud` the mirror `flip-x`, `action_turn_rad` the rotations, `reward_offset` (who touches
     a place right of the prey is rewarded) the mirror `flip-x`.
 
-    Heuristics: `chase` (predators run at the prey; with `control="prey"`: the fleeing prey).
+    Heuristics: `chase` (predators run at the prey; with `control="prey"`: the fleeing prey), `blind` (learning
+    predators that see no prey circle around the middle).
 
-    Anchors, `esp` convention, return of one predator per episode against the random prey: random 3.1, chase 88
+    Anchors, `esp` convention, return of one predator per episode against the random prey: random 3.1, blind 6, chase 88
     (against the fleeing prey 63, against a still one 167).
 
     Versions:
@@ -96,7 +98,7 @@ class PredatorPrey(ParticleTask):
     """
 
     Settings: ClassVar[type[PredatorPreySettings]] = PredatorPreySettings
-    heuristics = ("chase",)
+    heuristics: tuple[str, ...] = ("chase", BLIND)
     settings: PredatorPreySettings
     solid = True
 
@@ -104,6 +106,8 @@ class PredatorPrey(ParticleTask):
         self._prey_learns = settings.control != "predators"
         self.first_learner = settings.num_predators if settings.control == "prey" else 0
         super().__init__(settings, num_envs, generators)
+        if settings.control != "predators":
+            self.heuristics = ("chase",)
         lanes, horizon = self.worlds.num_lanes, settings.horizon
         self._prey_plan = torch.zeros(horizon, 2, lanes, device=self.device)
         self.world["prey_moves"] = self._by_world(self._prey_plan)
@@ -147,8 +151,10 @@ class PredatorPrey(ParticleTask):
         return torch.cat([world["prey_velocity"], prey, *ways], -1).squeeze(-2)
 
     def heuristic(self, name: str | None = None) -> Tensor:
-        """Return the joint action of `chase`: that of predators that learn, the flight of such a prey."""
-        self.named_heuristic(name)
+        """Return the joint action of `chase`: that of predators that learn, a fleeing prey's; or of `blind`."""
+        if self.named_heuristic(name) == BLIND:
+            position = self.worlds.position[: self.settings.num_predators]
+            return self._to_action(circle(position, BLIND_RADIUS * self.settings.half_side))
         sides = {"predators": self._chase, "prey": self._flight}
         learning = [wish() for side, wish in sides.items() if self.settings.control in (side, "both")]
         return self._to_action(torch.cat(learning))
@@ -239,6 +245,13 @@ def out_of_bounds(position: Tensor) -> Tensor:
 def chase(predator: Tensor, predator_velocity: Tensor, prey: Tensor, prey_velocity: Tensor) -> Tensor:
     """Return the wishes [N, 2, W] of predators [N, 2, W] that run at the prey [2, W]."""
     return URGENCY * (prey + PREY_LEAD_S * prey_velocity - predator - OWN_LEAD_S * predator_velocity)
+
+
+def circle(predator: Tensor, radius: float) -> Tensor:
+    """Return the wishes of predators [N, 2, W] that go around the origin, counter-clockwise, at this radius."""
+    distance = predator.norm(dim=1, keepdim=True).clamp_min(_TINY)
+    out = predator / distance
+    return torch.stack([-out[:, 1], out[:, 0]], 1) + URGENCY * (radius - distance) * out
 
 
 def flee(predator: Tensor, prey: Tensor, bound: float = BOUND) -> Tensor:
