@@ -130,7 +130,7 @@ _own_class = _option_parser(_named_class, "module:Class")
 
 
 def not_over_a_run(context: typer.Context, path: T) -> T:
-    """Return the path of an option that writes a table or results, unless it is what a run or a study needs.
+    """Return the path of an option that writes a table or results, unless it is a folder or what a run or study needs.
 
     Only `esp eval` may write the final evaluation of a run.
     """
@@ -141,6 +141,8 @@ def not_over_a_run(context: typer.Context, path: T) -> T:
     from esp_cli.files.documents import begins_with  # pydantic comes with it, which no help needs
 
     real = Path(os.path.realpath(str(path)))  # a link is followed when it is written
+    if real.is_dir():  # known before hours of work
+        raise UserError(f"{path} is a folder; name a file in it")
     documents = (of.CONFIG, of.STUDY, of.TUNING)
     names = (*documents, of.METRICS, of.POLICY, of.INITIAL, of.LOCK, of.JOURNAL, of.STUDY_LOCK)
     owned = real.is_file() and real.name in (names if context.info_name == "eval" else (*names, of.FINAL))

@@ -43,7 +43,7 @@ def test_a_link_given_to_json_is_followed_and_kept(tmp_path: Path) -> None:
     ("place", "reason"),
     [
         ("", "is empty; write its value, or leave it out"),
-        (".", "is a directory"),
+        (".", "is a folder; name a file in it"),
         ("x" * 300, "file name too long"),
         ("a" * 200 + "/" + "b" * 300, "file name too long"),
         ("loop", "too many levels of symbolic links"),

@@ -151,7 +151,8 @@ def test_the_blind_share_out_fixed_places_whatever_the_landmarks_are() -> None:
     # from (0.7, 0.4) to 0.8 (0.5, 0.5) = (0.4, 0.4): left; and each other by a quarter turn on: down, right, up
     assert env.heuristic("blind").tolist() == [[[1, 3, 2, 4]] * 2]
     assert not torch.equal(*env.heuristic("nearest")[0])
-    assert make("navigation", 1, [0], {"num_agents": 40, "sees": 3}).heuristics == ("nearest",)
+    assert make("navigation", 1, [0], {"num_agents": 40, "sees": 3}).heuristics == ("nearest", "blind")
+    assert make("navigation", 1, [0], {"num_agents": 65}).heuristics == ("nearest",)
 
 
 def test_the_former_name_of_a_heuristic_still_names_it() -> None:

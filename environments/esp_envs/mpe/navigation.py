@@ -116,7 +116,7 @@ class Navigation(ParticleTask):
 
     Heuristics: `nearest` (each agent takes a landmark of its own, above 8 agents by the Hungarian method), `cover`
     (agents share out all landmarks between them, for L > N; where there are at most 4096 ways, N^L, to do so), `blind`
-    (sees no landmark: agents share out the places from which the nearest is least far in the mean; without `sees`).
+    (sees no landmark: up to 64 agents share out the places from which the nearest is least far in the mean).
 
     Anchors, `esp` convention, N = L = 3, return of one agent per episode: random -218, blind -166, nearest -112,
     cover -109.
@@ -133,7 +133,7 @@ class Navigation(ParticleTask):
         super().__init__(settings, num_envs, generators)
         agents, landmarks = settings.num_agents, settings.landmarks
         shared = () if landmarks * math.log(agents) > math.log(covering.MAX_SHARINGS) else ("cover",)
-        self.heuristics = ("nearest", *shared, *(() if settings.many else (BLIND,)))
+        self.heuristics = ("nearest", *shared, *((BLIND,) if agents <= covering.MOST_PLACES else ()))
 
     def _describe(self) -> TaskSpec:
         settings = self.settings
