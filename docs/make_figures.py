@@ -39,10 +39,10 @@ BREAKING = {
 }
 """Figures in docs/measured, one for each setting -> how the names of the results go on that are drawn together."""
 TUNED = {
-    "tuned-navigation": ("mappo", "maddpg", "qmix"),
-    "tuned-predator-prey": ("mappo", "maddpg", "qmix"),
+    "tuned-navigation": ("tuned-navigation-mappo", "tuned-navigation-maddpg", "tuned-navigation-qmix"),
+    "tuned-predator-prey": ("tuned-mappo", "tuned-maddpg", "tuned-qmix"),
 }
-"""Figures in docs/measured -> the ends of the names of the results that are drawn together."""
+"""Figures in docs/measured -> the results that are drawn together, those of the figure's task."""
 TASKS = ("navigation", "predator-prey", "formation")
 """From top to bottom in the figure of the steps."""
 Row = dict[str, str]
@@ -130,14 +130,17 @@ def draw_results() -> None:
             learner = cells[0].name.split("-")[1]
             drawn = dots(groups, MEASURED / f"{picture}-{learner}", panel, f"{results.mode} return", anchors)
             drawn.svg.unlink()  # the pages show PNGs
-    for picture, learners in TUNED.items():
-        searches = [read_results(MEASURED / f"{picture}-{learner}.json") for learner in learners]
+    for picture, names in TUNED.items():
+        searches, task = [read_results(MEASURED / f"{name}.json") for name in names], picture.removeprefix("tuned-")
         groups = {
-            f"{cell.panel.split(', ', 1)[1]}: {cell.variant}": floats(cell.returns[search.mode])
-            for search in searches
+            f"{name.rpartition('-')[2].upper()}, {cell.panel.rpartition(', ')[2]}: {cell.variant}": floats(
+                cell.returns[search.mode]
+            )
+            for name, search in zip(names, searches, strict=True)
             for cell in search.cells
+            if cell.panel.startswith(task)
         }
-        title = f"{picture.removeprefix('tuned-').capitalize()}, tuned and default settings"
+        title = f"{task.capitalize()}, tuned settings"
         dots(groups, MEASURED / picture, title, f"{searches[0].mode} return").svg.unlink()
     for picture, parts in {"ablate-coefficient": ("",), **BREAKING}.items():
         whole = join([read_results(MEASURED / f"{picture}{part}.json") for part in parts])

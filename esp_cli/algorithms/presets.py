@@ -133,11 +133,7 @@ TUNED: dict[str, dict[str, Sections]] = {
 # What this loses per step, a larger rate and a nearer horizon bring back.
 _FEWER_PASSES: dict[str, object] = {"num_envs": 128, "num_epochs": 5, "num_minibatches": 5, "learning_rate": 4e-3}
 _ON_PARTICLES: Sections = {"mappo": {**_FEWER_PASSES, "gamma": 0.95, "gae_lambda": 0.9}}
-# Formation lasts long, and half as many worlds between updates take half the steps.
-_ON_ROBOTS: Sections = {"mappo": {"num_envs": 4}}
-FAST: dict[str, dict[str, Sections]] = {
-    "mappo": {"navigation": _ON_PARTICLES, "predator-prey": _ON_PARTICLES, "formation": _ON_ROBOTS}
-}
+FAST: dict[str, dict[str, Sections]] = {"mappo": {"navigation": _ON_PARTICLES, "predator-prey": _ON_PARTICLES}}
 
 # A network over sets learns each landmark and each agent once, not for every order of them.
 _SETS: Sections = {"network": {"name": "set"}}

@@ -169,7 +169,7 @@ PresetOption = Annotated[
     str,
     Option(
         "--preset",
-        help="'default' (measured best), 'fast' (fewer seconds, more steps) or 'paper' (the paper's settings).",
+        help="'default' (measured best), 'fast' (fewer seconds) or 'paper' (the paper's settings).",
     ),
 ]
 StepsOption = Annotated[

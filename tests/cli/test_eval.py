@@ -25,7 +25,7 @@ def test_the_result_has_the_documented_keys_and_its_parts_agree(finished: Path, 
     assert set(result) == DOCUMENTED | BESIDE
     assert (result["task"], result["task_version"], result["episodes"]) == ("navigation", 1, 4)
     assert (result["source"], result["step"], result["seeds"]) == (str(finished), 150, [3, 7])
-    assert set(result["anchors"]) == {"random", "heuristic", "cover"}
+    assert set(result["anchors"]) == {"random", "heuristic", "cover", "blind"}
     assert set(result["metrics"]) == {"collisions", "collisions_per_agent", "landmark_distance", "coverage"}
     for mode in ("greedy", "stochastic"):
         verdict = result[mode]
@@ -78,7 +78,7 @@ def test_several_seeds_state_their_error_over_seeds_and_say_so(finished: Path) -
     told = esp("eval", finished, "--episodes", 4).stdout
     assert "95 % interval over seeds, of reference policies over episodes" in told
     spread = json.loads(esp("eval", finished, "--episodes", 4, "--json", "-").stdout)["over_episodes"]
-    assert set(spread) == {"random", "heuristic", "cover"}, "the policy's episodes are those of two seeds"
+    assert set(spread) == {"random", "heuristic", "cover", "blind"}, "the policy's episodes are those of two seeds"
 
 
 def test_a_policy_that_was_chosen_by_its_task_is_named() -> None:

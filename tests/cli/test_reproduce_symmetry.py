@@ -29,7 +29,7 @@ def test_a_dry_run_states_the_cost_of_each_method_and_makes_nothing(tmp_path: Pa
     ("arguments", "sentence"),
     [
         (["symmetry", "--methods", "magic"], "'magic' is no method"),
-        (["symmetry", "--algo", "qmix"], "trains mappo alone"),
+        (["symmetry", "--algo", "mappo,qmix"], "this benchmark tunes one learner"),
         (["table1", "--budget", "3"], "--methods and --budget are for esp reproduce symmetry"),
         (["agents", "--methods", "plain"], "--methods and --budget are for esp reproduce symmetry"),
     ],

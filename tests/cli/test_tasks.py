@@ -50,7 +50,7 @@ def test_a_card_as_json() -> None:
     }  # fmt: skip
     assert card["observation"][0] == {"index": "0..1", "field": "velocity", "kind": "vector x 1", "unit": "length/s"}
     assert card["actions"] == ["0 no-op (0, 0)", "1 left (-1, 0)", "2 right (1, 0)", "3 down (0, -1)", "4 up (0, 1)"]
-    assert card["heuristics"] == ["nearest", "cover"]
+    assert card["heuristics"] == ["nearest", "cover", "blind"]
     assert card["settings"]["num_agents"]["default"] == 3
     assert all(setting["description"] for setting in card["settings"].values())
 

@@ -47,8 +47,8 @@ def test_a_final_evaluation_states_what_was_played_and_is_json(tmp_path):
     assert (result.task, result.task_version, result.convention) == ("navigation", 1, trained.spec.convention)
     assert (result.source, result.step, result.seeds, result.episodes) == (str(tmp_path), 0, (3, 7), 3)
     assert result.greedy.per_seed != result.stochastic.per_seed
-    assert json.loads(result.model_dump_json())["anchors"].keys() == {"random", "heuristic", "cover"}
-    assert result.heuristics == ("nearest", "cover")
+    assert json.loads(result.model_dump_json())["anchors"].keys() == {"random", "heuristic", "cover", "blind"}
+    assert result.heuristics == ("nearest", "cover", "blind")
     assert result.anchor_metrics.keys() == result.anchors.keys()
     assert all(metrics.keys() == result.metrics.keys() for metrics in result.anchor_metrics.values())
     for name, values in result.metrics_per_seed.items():
