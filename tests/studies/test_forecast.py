@@ -92,8 +92,8 @@ def test_twice_the_steps_cost_about_twice_the_iterations_and_evaluations(monkeyp
     # 20 and 40 iterations; 11 and 21 evaluations of 2 x 2 episodes; an episode takes half a tick
     iteration = (two.training_s - one.training_s - 10 * 4 * 0.5) / 20
     assert one.training_s == pytest.approx(20 * iteration + 11 * 4 * 0.5)
-    # greedy, drawn, random, and the two heuristics of navigation, four episodes each
-    assert one.evaluation_s == two.evaluation_s == 5 * 4 * 0.5
+    # greedy, drawn, random, and the three heuristics of navigation, four episodes each
+    assert one.evaluation_s == two.evaluation_s == 6 * 4 * 0.5
 
 
 def test_other_work_on_the_machine_costs_a_run_nothing(monkeypatch):
