@@ -25,6 +25,7 @@ from esp_cli.training.build import (
     play,
 )
 from esp_cli.training.config import RunConfig
+from esp_envs.base import BLIND
 from esp_envs.errors import UserError
 from esp_envs.registry import TASKS
 
@@ -130,7 +131,8 @@ def rough_anchors(config: RunConfig, episodes: int) -> dict[str, float]:
     episodes = min(episodes, _ROUGH_AGENT_STEPS // (world.spec.horizon * world.spec.num_agents))
     if world.spec.roles or not world.heuristics or episodes < 2:
         return {}
-    played = {name: one.returns[0] for name, one in play_references(config, world.heuristics, episodes).items()}
+    names = [name for name in world.heuristics if name != BLIND]  # which is not the best, and no end of the scale
+    played = {name: one.returns[0] for name, one in play_references(config, names, episodes).items()}
     anchors = {name: float(returns.mean()) for name, returns in played.items()}
     error = max(float(returns.std()) for returns in played.values()) / episodes**0.5
     return anchors if error < _ROUGH_ERROR * (max(anchors.values()) - anchors["random"]) else {}

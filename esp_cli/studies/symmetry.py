@@ -176,9 +176,7 @@ class Benchmark:
         self.request, self.budget = request, budget
         self.methods = tuple(METHODS if request.variants is None else request.variants)
         self.boards = {name: TASKS.get(name) or Board(name) for name in request.tasks or TASKS}
-        self.algorithm, *others = request.algorithms or ("mappo",)
-        if others or self.algorithm not in SPACES:
-            raise UserError(f"this benchmark tunes one learner, whose space it has; --algo {', '.join(SPACES)}")
+        self.algorithm = (request.algorithms or ("mappo",))[0]
         self._refuse_wrong()
         self.left_out: dict[str, str] = {}
         for board in self.boards.values():
@@ -194,6 +192,8 @@ class Benchmark:
             if name not in METHODS or self.methods.count(name) > 1:
                 fault = "is named twice" if name in METHODS else "is no method"
                 raise UserError(f"'{name}' {fault}; name each once: {', '.join(map(repr, METHODS))}")
+        if len(self.request.algorithms or ()) > 1 or self.algorithm not in SPACES:
+            raise UserError(f"this benchmark tunes one learner, whose space it has; --algo {', '.join(SPACES)}")
         if shared := set(self.request.seeds) & set(TRIAL_SEEDS):
             raise UserError(f"seed {min(shared)} belongs to the trials; choose seeds that no trial has")
         own = {name for method in self.methods for name in METHODS[method]}
@@ -235,8 +235,11 @@ class Benchmark:
         board, request, algorithm = self.boards[name], self.request, self.algorithm
         preset = board.preset if (request.preset, algorithm) == ("default", "mappo") else request.preset
         networks = dict(zip((PERCEPTRON, HOMOMORPHIC), board.networks, strict=True))
-        own = {key: networks.get(str(value), value) for key, value in METHODS[method].items()}
-        own = {key: value for key, value in own.items() if concerns(key, board.task, algorithm)}
+        own = {
+            key: networks.get(str(value), value)
+            for key, value in METHODS[method].items()
+            if concerns(key, board.task, algorithm)
+        }
         given = {
             task_setting(key, board.task): value
             for key, value in request.overrides.items()

@@ -140,7 +140,7 @@ def test_rough_anchors_are_near_those_of_many_episodes_and_absent_where_they_wou
     )
     for name, value in rough.items():
         assert value == pytest.approx(float(many[name].returns.mean()), abs=12), "of 85 between them"
-    assert set(rough) == set(many)
+    assert set(rough) == set(many) - {"blind"}, "which is no end of the scale"
     assert rough_anchors(config, 1) == {}, "one episode has no error"
     crowd = resolve_config("navigation", seeds=[0], overrides={"task.num_agents": 120, "task.num_landmarks": 120})
     assert rough_anchors(crowd, 64) == {}, "one episode is more than a second's worth"

@@ -47,7 +47,7 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 STORE = 80 * 2**20
 STEPS = 9000
-"""120 iterations: time enough to lose something in the middle."""
+"""180 iterations: time enough to lose something in the middle."""
 
 
 @pytest.fixture(scope="module")
