@@ -33,7 +33,6 @@ class SeedParameters:
         """Return a new buffer [S, P] of tensors [S, ...] in the order of the parameters."""
         return torch.cat([*(tensor.flatten(1) for tensor in tensors), self._rest], 1)
 
-    @torch.no_grad()
     def sum(self, gradients: Sequence[tuple[Sequence[Tensor], Sequence[Tensor]]]) -> Tensor:
         """Return a new buffer [S, P] of the sum of gradients by some of the parameters.
 

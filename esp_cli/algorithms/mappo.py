@@ -25,10 +25,11 @@ from esp_cli.algorithms.objectives import (
     gae,
     normalise_per_seed,
     ppo_loss,
+    value_error,
     value_loss,
 )
 from esp_cli.algorithms.rollout import Batch, Collector, Rollout, values_along
-from esp_cli.networks.contract import NetworkConfig, Reads, WithVJP
+from esp_cli.networks.contract import NetworkConfig, Reads
 from esp_cli.networks.policy import Critic, StochasticPolicy
 from esp_cli.prior import Answers, Copies, Loss, mean_per_seed
 from esp_envs.base import Environment
@@ -255,13 +256,9 @@ class Mappo(Learner):
         if sums is not None:
             self._watch(copies.originals, copies.original(outputs.tensor), copies.original(values.tensor), weight, sums)
         loss = ppo_loss(head, outputs, copies, config.clip_epsilon, entropy_coef)
-        loss = loss + config.value_coef * self._value_loss(values, copies)
-        return loss + copies.penalty(policy=(head, outputs), value=values)
-
-    def _value_loss(self, values: WithVJP | Tensor, copies: Copies[Batch]) -> Loss:
-        config = self.config
         clip = config.clip_epsilon if config.clip_value else None
-        return value_loss(values, copies.originals.target, copies, config.huber_delta, clip)
+        loss = loss + config.value_coef * value_loss(values, copies.originals.target, copies, config.huber_delta, clip)
+        return loss + copies.penalty(policy=(head, outputs), value=values)
 
     @torch.no_grad()
     def _watch(self, batch: Batch, outputs: Tensor, values: Tensor, weight: float, sums: dict[str, Tensor]) -> None:
@@ -274,10 +271,12 @@ class Mappo(Learner):
             "clip_fraction": ((ratio - 1).abs() > config.clip_epsilon).float(),
             "kl": ratio - 1 - log_ratio,
             "entropy": head.entropy(outputs),
-            "policy_loss": -clipped_surrogate(log_ratio, batch.advantage, config.clip_epsilon)[0],
+            "policy_loss": -clipped_surrogate(log_ratio, batch.advantage, config.clip_epsilon),
         }
         means = {name: mean_per_seed(part, batch.mask) for name, part in parts.items()}
-        _add(sums, weight, **means, value_loss=self._value_loss(values, self.prior.alone(batch)).value)
+        old = batch.value if config.clip_value else None
+        error = value_error(values, batch.target, config.huber_delta, old, config.clip_epsilon)
+        _add(sums, weight, **means, value_loss=mean_per_seed(error, batch.valued(self.num_values)))
 
     def answers(self, rows: Batch) -> Answers:
         """Return what policy and critic say of rows, for `SymmetryPrior.errors`."""

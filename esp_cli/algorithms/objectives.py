@@ -124,29 +124,40 @@ def ppo_loss(head: Any, outputs: Any, copies: Copies[Any], clip_epsilon: float, 
     advantage = batch.advantage.flatten(1).unsqueeze(1)
 
     def equation(policies: Policies, weight: float, slope: Any) -> Stated:
-        def stated() -> tuple[Tensor, Tensor]:
-            log_ratio = policies.log_prob(batch.action, learned).sub_(old_log_prob)
-            objective, by_log_ratio = clipped_surrogate(log_ratio, advantage, clip_epsilon)
-            return objective.neg_().sub_(policies.entropy(learned), alpha=entropy_coef), by_log_ratio
+        def log_ratio() -> Tensor:
+            return policies.log_prob(batch.action, learned).sub_(old_log_prob)
+
+        def stated() -> Tensor:
+            objective = clipped_surrogate(log_ratio(), advantage, clip_epsilon)
+            return objective.neg_().sub_(policies.entropy(learned), alpha=entropy_coef)
 
         share = shares(batch.mask, (len(advantage), learned, advantage.shape[2]))
         by_objective = -weight * share
         if isinstance(policies, CompiledCategoricalPolicies):
             weights = (by_objective, entropy_coef * by_objective)
             clipped = Clipped(batch.action, learned, old_log_prob, advantage, clip_epsilon, *weights)
-            return Stated(lambda: stated()[0], share, policies.add_clipped_slope(slope, clipped))
-        loss, by_log_ratio = stated()
-        slope = policies.add_slope(slope, batch.action, by_log_ratio.mul_(by_objective), entropy_coef * by_objective)
-        return Stated(lambda: loss, share, slope)
+            return Stated(stated, share, policies.add_clipped_slope(slope, clipped))
+        by_log_ratio = surrogate_slope(log_ratio(), advantage, clip_epsilon).mul_(by_objective)
+        return Stated(stated, share, policies.add_slope(slope, batch.action, by_log_ratio, entropy_coef * by_objective))
 
     return Loss(Term(copies.policies(head, outputs), 1.0, equation))
 
 
-def clipped_surrogate(log_ratio: Tensor, advantage: Tensor, clip_epsilon: float) -> tuple[Tensor, Tensor]:
-    """Return PPO's objective min(rho A, clip(rho, 1 - eps, 1 + eps) A), and its slope by log rho: rho A, or 0."""
+def clipped_surrogate(log_ratio: Tensor, advantage: Tensor, clip_epsilon: float) -> Tensor:
+    """Return PPO's objective min(rho A, clip(rho, 1 - eps, 1 + eps) A)."""
+    return torch.minimum(*_gain_and_bound(log_ratio, advantage, clip_epsilon))
+
+
+def surrogate_slope(log_ratio: Tensor, advantage: Tensor, clip_epsilon: float) -> Tensor:
+    """Return the slope of `clipped_surrogate` by log rho: rho A, or 0 where it is clipped."""
+    gain, bound = _gain_and_bound(log_ratio, advantage, clip_epsilon)
+    return gain.masked_fill_(gain > bound, 0.0)
+
+
+def _gain_and_bound(log_ratio: Tensor, advantage: Tensor, clip_epsilon: float) -> tuple[Tensor, Tensor]:
     ratio = log_ratio.exp()
-    gain, bound = ratio * advantage, ratio.clamp(1 - clip_epsilon, 1 + clip_epsilon) * advantage
-    return torch.minimum(gain, bound), gain.masked_fill(gain > bound, 0.0)
+    gain = ratio * advantage
+    return gain, ratio.clamp(1 - clip_epsilon, 1 + clip_epsilon).mul_(advantage)
 
 
 def value_loss(
@@ -163,35 +174,50 @@ def value_loss(
     target = target.flatten(1).unsqueeze(1)
 
     def equation(on: Values, weight: float, slope: Tensor | None) -> Stated:
-        def stated() -> tuple[Tensor, Tensor]:
+        def stated() -> Tensor:
             return value_error(on.rows[:, :learned], target, huber_delta, old, clip_epsilon or 0.0)
 
         share = shares(mask, (on.sizes[0], learned, on.sizes[2]))
         if on.defers and slope is None and old is None and isinstance(share, float):
             asked = Regression(target, learned, huber_delta, weight * share)
-            return Stated(lambda: stated()[0], share, asked)
-        error, by_value = stated()
+            return Stated(stated, share, asked)
+        by_value = value_slope(on.rows[:, :learned], target, huber_delta, old, clip_epsilon or 0.0)
         by_value.mul_(weight * share)
         if slope is None and learned == on.sizes[1]:
-            return Stated(lambda: error, share, by_value)
+            return Stated(stated, share, by_value)
         slope = torch.zeros_like(on.rows) if slope is None else slope
         slope[:, :learned].add_(by_value)
-        return Stated(lambda: error, share, slope)
+        return Stated(stated, share, slope)
 
     return Loss(Term(outputs, 1.0, equation))
 
 
 def value_error(
     value: Tensor, target: Tensor, huber_delta: float, old_value: Tensor | None = None, clip_epsilon: float = 0.0
-) -> tuple[Tensor, Tensor]:
-    """Return `value_loss` and its slope by element: e^2 / 2 within delta, delta (|e| - delta / 2) beyond."""
-    target = target.expand_as(value)
-    loss = huber_loss(value, target, reduction="none", delta=huber_delta)
-    slope = (value - target).clamp(-huber_delta, huber_delta)
+) -> Tensor:
+    """Return `value_loss` by element: e^2 / 2 within delta, delta (|e| - delta / 2) beyond."""
+    error = _huber(value, target, huber_delta)
     if old_value is None:
-        return loss, slope
-    moved = value - old_value
-    clipped = old_value + moved.clamp(-clip_epsilon, clip_epsilon)
-    other = huber_loss(clipped, target, reduction="none", delta=huber_delta)
-    within = (clipped - target).clamp(-huber_delta, huber_delta) * (moved.abs() <= clip_epsilon)
-    return torch.maximum(loss, other), torch.where(loss >= other, slope, within)
+        return error
+    return torch.maximum(error, _huber(_kept_near(old_value, value, clip_epsilon), target, huber_delta))
+
+
+def value_slope(
+    value: Tensor, target: Tensor, huber_delta: float, old_value: Tensor | None = None, clip_epsilon: float = 0.0
+) -> Tensor:
+    """Return the slope of `value_error` by each value: e within delta, delta with its sign beyond; 0 where clipped."""
+    slope = (value - target).clamp_(-huber_delta, huber_delta)
+    if old_value is None:
+        return slope
+    kept = _kept_near(old_value, value, clip_epsilon)
+    within = (kept - target).clamp_(-huber_delta, huber_delta) * ((value - old_value).abs() <= clip_epsilon)
+    return torch.where(_huber(value, target, huber_delta) >= _huber(kept, target, huber_delta), slope, within)
+
+
+def _huber(value: Tensor, target: Tensor, delta: float) -> Tensor:
+    return huber_loss(value, target.expand_as(value), reduction="none", delta=delta)
+
+
+def _kept_near(old_value: Tensor, value: Tensor, clip_epsilon: float) -> Tensor:
+    """Return V_old + clip(V - V_old, -eps, eps)."""
+    return old_value + (value - old_value).clamp_(-clip_epsilon, clip_epsilon)

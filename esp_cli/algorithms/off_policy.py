@@ -181,7 +181,7 @@ class OffPolicyLearner(Learner):
     @torch.no_grad()
     def td_metrics(self, values: Tensor, target: Tensor, batch: EpisodeBatch) -> dict[str, Tensor]:
         """Return what is logged of a step: L_TD and the mean value, over the originals; [S, B, T, C] each."""
-        (error, _), valued = value_error(values, target, self.config.huber_delta), batch.valued(values.shape[-1])
+        error, valued = value_error(values, target, self.config.huber_delta), batch.valued(values.shape[-1])
         return {"td_loss": mean_per_seed(error, valued), "value": mean_per_seed(values, valued)}
 
     def adam(self, module: nn.Module, *others: nn.Module, learning_rate: float) -> SeedAdam:

@@ -77,10 +77,8 @@ class Collector:
         noise = noise.to(device, non_blocking=True)
         obs = torch.empty(*lead, spec.num_agents, spec.observation.width, device=device)
         state = torch.empty(*lead, spec.state.width, device=device)
-        reward = torch.empty(*lead, spec.num_agents, device=device)
-        terminated = torch.empty(lead, dtype=torch.bool, device=device)
-        ended = torch.empty_like(terminated)
         outputs, actions, masks, alive, gone, finals = [], [], [], [], [], {}
+        rewards, terminated, over = [], [], []
         for t in range(num_steps):
             obs[:, :, t], state[:, :, t] = self.observation.obs, self.observation.state
             output, self.memory = self.policy.step(self.observation.obs, self.memory, self.observation.action_mask)
@@ -90,18 +88,21 @@ class Collector:
             step = self.env.step(self.policy.head.to_environment(action))
             outputs.append(output)
             actions.append(action)
-            reward[:, :, t], terminated[:, :, t], ended[:, :, t] = step.reward, step.terminated, step.ended
+            ended = step.ended
+            rewards.append(step.reward)
+            terminated.append(step.terminated)
+            over.append(ended)
             if step.final is not None:
                 finals[t] = step.final
             after = step.reached.alive
             gone.append(None if after is None else ~after)
-            self._finish(step.reward, ended[:, :, t], step.final is not None)
+            self._finish(step.reward, ended, step.final is not None)
             self.observation = step.next
         action_rows = torch.stack(actions, 2)
         log_prob = self.policy.head.log_prob(torch.stack(outputs, 2), action_rows)
         flags = (stacked(flags) for flags in (masks, alive, gone))
-        seen, done = (obs, state, action_rows, log_prob), (reward, terminated, ended)
-        return Rollout(*seen, *done, self.observation, finals, *flags)
+        done = (torch.stack(rewards, 2), torch.stack(terminated, 2), torch.stack(over, 2))
+        return Rollout(obs, state, action_rows, log_prob, *done, self.observation, finals, *flags)
 
     def _finish(self, reward: Tensor, ended: Tensor, any_ended: bool) -> None:
         """Add up returns (mean over agents of the sum over time) and empty the memory of ended episodes."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from functools import cached_property
+from functools import cached_property, lru_cache
 from math import prod
 from typing import Any
 
@@ -63,9 +63,14 @@ class CategoricalPolicies(Policies):
 
     def __init__(self, outputs: WithVJP, frame: Frame) -> None:
         self._outputs, self._frame = outputs, frame
-        logits = frame.pull_outputs(outputs.tensor)
-        self._shape = logits.shape
-        self.log_probs = torch.log_softmax(logits.movedim(-1, 1).flatten(3), 1)
+        orders = frame.orders(outputs.size[-1]) if frame.parts > 1 else None
+        self._places = None if orders is None else _places(orders.expand(outputs.size[0], -1, -1))
+        if self._places is None:
+            logits = frame.pull_outputs(outputs.tensor).movedim(-1, 1).flatten(3)
+        else:
+            by_action = outputs.tensor.flatten(1, -2).transpose(1, 2).unflatten(2, (frame.parts, -1))
+            logits = by_action.reshape(-1, by_action.shape[3]).index_select(0, self._places).view(by_action.shape)
+        self.log_probs = torch.log_softmax(logits, 1)
         self.probs = self.log_probs.exp()
         self._inner, self.sizes = self.probs * self.log_probs, (len(logits), *self.probs.shape[2:])
 
@@ -84,7 +89,7 @@ class CategoricalPolicies(Policies):
 
     def add_slope(self, slope: Tensor | None, action: Tensor, by_log_prob: Tensor, by_entropy: Weights) -> Tensor:
         learned = by_log_prob.shape[1]
-        if slope is None and learned == self._shape[1]:
+        if slope is None and learned == self.sizes[1]:
             slope = self._inner * -_beside(by_entropy)
         else:
             slope = torch.zeros_like(self.probs) if slope is None else slope
@@ -93,13 +98,20 @@ class CategoricalPolicies(Policies):
 
     def add_divergence_slope(self, slope: Tensor | None, weights: Weights) -> Tensor:
         slope, weights = torch.zeros_like(self.probs) if slope is None else slope, _beside(weights)
-        slope[:, :, 1:].add_(self._gap(slice(1, None), slice(1)) * weights)
-        slope[:, :, :1].sub_((self.probs[:, :, 1:] * weights).sum(2, keepdim=True))
+        slope[:, :, 1:].add_(self._gap(slice(1, None), slice(1)).mul_(weights))
+        by_original = self.probs[:, :, 1:] * weights
+        slope[:, :, :1].sub_(by_original if by_original.shape[2] == 1 else by_original.sum(2, keepdim=True))
         return slope
 
     def back(self, slope: Tensor) -> list[tuple[WithVJP, Tensor]]:
-        by_logits = torch.addcmul(slope, self.probs, slope.sum(1, keepdim=True), value=-1)
-        return [(self._outputs, self._frame.push_outputs(by_logits.unflatten(3, self._shape[2:5]).movedim(1, -1)))]
+        by_logits = torch._log_softmax_backward_data(slope, self.log_probs, 1, slope.dtype)
+        rows = self._outputs.size[1:-1]
+        if self._places is not None:
+            moved = torch.empty_like(by_logits).view(-1, self.sizes[2])
+            moved.index_copy_(0, self._places, by_logits.view(moved.shape))
+            return [(self._outputs, moved.view(*by_logits.shape[:2], -1).transpose(1, 2).unflatten(1, rows))]
+        by_logits = by_logits.unflatten(3, (rows[0] // self.sizes[1], *rows[1:])).movedim(1, -1)
+        return [(self._outputs, self._frame.push_outputs(by_logits))]
 
 
 class CompiledCategoricalPolicies(Policies):
@@ -142,6 +154,18 @@ class CompiledCategoricalPolicies(Policies):
             return [(outputs.learn(lambda run: slope[0].learn(run, self._orders), self.sizes[1]), self._orders)]
         first, *others = map(self._choices.back, slope)
         return [(outputs, sum(others, start=first).unflatten(1, outputs.size[1:-1]))]
+
+
+def _places(orders: Tensor) -> Tensor:
+    """Return where, among rows [S A P] of outputs, those of the originals' actions are that orders [S, P, A] give."""
+    return torch.add(_first(*orders.shape, orders.device), orders.transpose(1, 2), alpha=orders.shape[1]).flatten()
+
+
+@lru_cache(8)
+def _first(num_seeds: int, num_parts: int, num_actions: int, device: torch.device) -> Tensor:
+    """Return where the first action of each seed and part is, [S, 1, P]."""
+    seeds, parts = (torch.arange(count, device=device) for count in (num_seeds, num_parts))
+    return (num_actions * num_parts * seeds).view(-1, 1, 1) + parts
 
 
 def divergence_by_choice(log_p: Tensor, log_q: Tensor, p: Tensor) -> Tensor:

@@ -136,10 +136,6 @@ class SymmetryPrior:
         used = self.augments or self.config.coefficient > 0
         return Copies(self.config, batch, self._draw(generators) if used else [], self.augments, adapt)
 
-    def alone(self, batch: Rows) -> Copies[Rows]:
-        """Return a batch without copies, as a learner's losses take it."""
-        return Copies(self.config, batch, [], augments=False)
-
     def stored(self, batch: Rows, generators: Sequence[torch.Generator]) -> list[Rows]:
         """Return the copies of new experience that a replay stores with it."""
         return [batch.transformed(g) for g in self._draw(generators)] if self._stores else []

@@ -63,5 +63,7 @@ class Frame:
         return x.unflatten(1, (self.parts, -1))
 
     def _each(self, parts: Tensor, move: Callable[[Transform], Callable[[Tensor], Tensor]]) -> Tensor:
+        if not self._transforms:
+            return parts
         here, *copies = parts.unbind(1)
         return torch.stack([here, *(move(g)(copy) for g, copy in zip(self._transforms, copies, strict=True))], 1)

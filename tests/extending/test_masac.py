@@ -142,7 +142,7 @@ def test_the_temperature_moves_the_entropy_to_its_target(actions, learns):
     rates = {"algo__temperature_learning_rate": 0.03 if learns else 1e-9, "algo__actor_learning_rate": 0.01}
     trained = soft(actions, prior__kind="none", algo__target_entropy=target, algo__initial_temperature=1e-3, **rates)
     batch = trained.collector.collect()[0]
-    copies, seen = trained.prior.alone(batch), trained.critic_rows(batch)[:, :, :-1]
+    copies, seen = trained.prior.copies(batch, []), trained.critic_rows(batch)[:, :, :-1]
     entropies = [trained.learn_actor(copies, seen)["entropy"] for _ in range(600)]
     gap = (torch.stack(entropies[-50:]).mean(0) - target).abs()
     assert (gap < 0.15).all() if learns else (gap > 0.5).all(), gap

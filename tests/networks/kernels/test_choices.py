@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from esp_cli.algorithms.objectives import clipped_surrogate
+from esp_cli.algorithms.objectives import surrogate_slope
 from esp_cli.networks.contract import WithVJP
 from esp_cli.networks.kernels.choices import Clipped, CompiledChoices, Slope
 from esp_cli.networks.policies import CategoricalPolicies, CompiledCategoricalPolicies
@@ -55,7 +55,7 @@ def test_a_clipped_objective_has_the_slope_of_torch(by_row):
     eager, compiled = both(("rot90",), False)
     action, old = torch.randint(4, (3, 9, 2, 2)), -torch.rand(3, 1, 36)
     advantage, weight = torch.randn(3, 1, 36), torch.rand(3, 1, 36) if by_row else 0.3
-    slope = clipped_surrogate(eager.log_prob(action, 2) - old, advantage, 0.2)[1]
+    slope = surrogate_slope(eager.log_prob(action, 2) - old, advantage, 0.2)
     assert 0 < (slope == 0).float().mean() < 1, "some are clipped"
     theirs = eager.back(eager.add_slope(None, action, slope * weight, 0.1 * weight))[0][1]
     asked = Clipped(action, 2, old, advantage, 0.2, weight, 0.1 * weight)
