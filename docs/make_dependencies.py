@@ -10,11 +10,10 @@ from __future__ import annotations
 
 import re
 import sys
+import tomllib
 from datetime import datetime
 from pathlib import Path
 from typing import Any
-
-import tomllib
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "dependencies.md"

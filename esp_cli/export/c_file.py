@@ -168,7 +168,7 @@ def c_runner(file: Path, program: Program) -> Runner:
         action: Numbers = np.empty(len(obs), np.intc) if choose else np.empty_like(outputs)
         written = [after] * (program.memory_width > 0) + [action] * (not choose or team > 1)
         tables = [np.ascontiguousarray(table) for table in (sets or {}).values()]
-        arrays = [*([] if mask is None else [mask.astype(np.uint8)]), *written]
+        arrays: list[Numbers] = [*([] if mask is None else [mask.astype(np.uint8)]), *written]
         for k in range(0, len(obs), team):
             given = [part for table in tables for part in (_address(table, k), table.shape[1])]
             chosen = code.esp_policy_act(_address(obs, k), *given, *(_address(array, k) for array in arrays))

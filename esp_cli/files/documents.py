@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-import sys
+import tomllib
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,11 +17,6 @@ from esp_cli.files.formatting import attempting, nearest, own_words, shortened
 from esp_cli.files.opening import read_regular
 from esp_cli.files.writing import replace_file
 from esp_envs.errors import UserError
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 Model = TypeVar("Model", bound=BaseModel)
 
