@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from functools import cached_property, lru_cache
+from functools import cached_property
 from math import prod
 from typing import Any
 
@@ -158,14 +158,10 @@ class CompiledCategoricalPolicies(Policies):
 
 def _places(orders: Tensor) -> Tensor:
     """Return where, among rows [S A P] of outputs, those of the originals' actions are that orders [S, P, A] give."""
-    return torch.add(_first(*orders.shape, orders.device), orders.transpose(1, 2), alpha=orders.shape[1]).flatten()
-
-
-@lru_cache(8)
-def _first(num_seeds: int, num_parts: int, num_actions: int, device: torch.device) -> Tensor:
-    """Return where the first action of each seed and part is, [S, 1, P]."""
-    seeds, parts = (torch.arange(count, device=device) for count in (num_seeds, num_parts))
-    return (num_actions * num_parts * seeds).view(-1, 1, 1) + parts
+    num_seeds, num_parts, num_actions = orders.shape
+    seeds, parts = (torch.arange(count, device=orders.device) for count in (num_seeds, num_parts))
+    first = (num_actions * num_parts * seeds).view(-1, 1, 1) + parts
+    return torch.add(first, orders.transpose(1, 2), alpha=num_parts).flatten()
 
 
 def divergence_by_choice(log_p: Tensor, log_q: Tensor, p: Tensor) -> Tensor:

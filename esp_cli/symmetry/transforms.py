@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -62,7 +62,7 @@ class Transform:
         by = self.output_map
         if self.agents is not None or not isinstance(by, Gather) or by.sign is not None:
             return None
-        return torch.stack([_in_order(by.width, by.back.device).expand_as(by.back), by.back], 1)
+        return torch.stack([torch.arange(by.width, device=by.back.device).expand_as(by.back), by.back], 1)
 
     @property
     def num_outputs(self) -> int:
@@ -146,11 +146,6 @@ class Transform:
         if self.num_seeds not in (1, *x.shape[:1]):
             raise UserError(f"a transform of {self.num_seeds} seeds was given data of {x.shape[0]}")
         return self.num_seeds
-
-
-@lru_cache(16)
-def _in_order(count: int, device: torch.device) -> Tensor:
-    return torch.arange(count, device=device)
 
 
 def build_transform(
