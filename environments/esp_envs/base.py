@@ -149,6 +149,8 @@ class Environment(ABC):
     renews: bool = True
     """Whether worlds whose episode ends begin the next one. Who sets each state may do without where that takes long;
     `next` then holds what was reached. An environment may ignore it."""
+    measures: bool = True
+    """Whether steps give metrics. Learners read none and do without; an environment may ignore it."""
     robot: ClassVar[Mapping[str, float]] = {}
     """Dimensions of the e-puck that a policy of this task can drive, by name with unit; empty for other tasks."""
 

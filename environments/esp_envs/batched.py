@@ -45,7 +45,7 @@ class BatchedTask(Environment):
     """
 
     makes_new_tensors: ClassVar[bool] = False
-    """Whether `_advance` and `_observe` return new memory in each call, so that their results need not be copied."""
+    """Whether `_start`, `_advance` and `_observe` return new memory in each call, which then need not be copied."""
 
     def __init__(self, settings: TaskSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
         super().__init__(settings, num_envs, generators)
@@ -156,6 +156,8 @@ class BatchedTask(Environment):
     def _episodes(self) -> World:
         """Draw an episode for every world."""
         drawn = [self._named("_start", self._start(generator)) for generator in self.generators]
+        if self.makes_new_tensors and len(drawn) == 1:
+            return {name: value.unsqueeze(0) for name, value in drawn[0].items()}
         return {name: torch.stack([one[name] for one in drawn]) for name in drawn[0]}
 
     def _begin_with(self, drawn: World) -> None:
@@ -188,7 +190,7 @@ class BatchedTask(Environment):
                 f"'_advance' of {self.spec.name} gives {type(outcome).__name__}; return a tensor of rewards and a dict "
                 "of metrics, as 'return reward, {}'"
             )
-        reward, metrics = outcome[0], self._named("_advance", outcome[1])
+        reward, metrics = outcome[0], self._named("_advance", outcome[1]) if self.measures else {}
         shared = reward.dim() == 2
         if shared:
             reward = reward.unsqueeze(-1).expand(-1, -1, self.spec.num_agents)
@@ -203,7 +205,7 @@ class BatchedTask(Environment):
         for name, value in metrics.items():
             if value.shape != self._worlds_shape:  # first, since the sentence takes time
                 require_shape(f"metric {name} that '_advance' of {self.spec.name} gives", value, self._worlds_shape)
-        if self._lost:
+        if self._lost and self.measures:
             self._lost -= metrics.keys()
             if self._lost and self._unproven == 1:
                 told = ", ".join(metrics) or "no metric"
@@ -276,7 +278,7 @@ class BatchedTask(Environment):
 
 def _owned(values: Tensor, is_new: bool) -> Tensor:
     """Return float32 numbers as contiguous memory that nothing else writes to."""
-    values = values.float()
+    values = values if values.dtype == torch.float32 else values.float()
     return values.contiguous() if is_new else values.clone(memory_format=torch.contiguous_format)
 
 

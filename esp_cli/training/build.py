@@ -51,9 +51,10 @@ _LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory
 _PROCESS_BYTES = 500 * 2**20  # of a process with torch and its libraries, before it trains
 
 
-def build_environment(config: RunConfig, num_envs: int, *stream: object) -> Environment:
+def build_environment(config: RunConfig, num_envs: int, *stream: object, measures: bool = True) -> Environment:
     """Make `num_envs` worlds per seed whose draws come from the named random stream, with the prior's compass."""
     env = make(config.task, num_envs, stream_seeds(config.seeds, *stream), config.task_settings, config.device)
+    env.measures = measures
     return with_compass(env, config.prior)
 
 
@@ -90,7 +91,7 @@ def build_learner(config: RunConfig) -> Learner:
     cls = ALGORITHMS[config.algorithm]
     settings = cls.config_class(**config.algorithm_settings)
     refuse_what_does_not_fit(config, settings, spec_of(config))
-    env = build_environment(config, settings.num_envs, "training worlds")
+    env = build_environment(config, settings.num_envs, "training worlds", measures=False)
     if env.spec.roles:
         return _learner_of_roles(cls, env, settings, config)
     own, of_prior = generators(config.seeds, "learner"), generators(config.seeds, "prior")

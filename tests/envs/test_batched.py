@@ -408,3 +408,20 @@ def test_a_check_that_has_no_time_says_what_it_did_not_cover_and_nothing_holds_u
     assert findings["a joint action of the wrong shape is refused"].not_covered is None
     done = check(Subject(lambda count, seeds: make("navigation", count, seeds)))
     assert not any(finding.not_covered for finding in done), "without a deadline all is looked at"
+
+
+@pytest.mark.parametrize("task", ["navigation", "predator-prey", "wildlife", "formation"])
+def test_worlds_that_do_not_measure_give_the_same_steps_without_metrics(task: str) -> None:
+    measuring, quiet = (make(task, 3, [5]) for _ in range(2))
+    quiet.measures = False
+    for env in (measuring, quiet):
+        env.reset()
+    for _ in range(4):
+        action = measuring.random_action()
+        assert torch.equal(action, quiet.random_action())
+        both = [env.step(action) for env in (measuring, quiet)]
+        assert set(measuring.spec.totals) <= both[0].metrics.keys() != {}
+        assert both[1].metrics == {}
+        assert torch.equal(both[0].reward, both[1].reward)
+        assert torch.equal(both[0].next.obs, both[1].next.obs)
+        assert torch.equal(both[0].next.state, both[1].next.state)

@@ -90,13 +90,13 @@ def test_a_world_does_not_depend_on_how_many_stand_beside_it(count: int) -> None
 def run_from(start: torch.Tensor, control: torch.Tensor) -> torch.Tensor:
     """Return the physics [rows, W] of pairs after ten steps of the same control."""
     worlds = ParticleWorlds(PAIR, start.shape[-1], CPU)
-    worlds.rows().copy_(start.reshape(8, -1))
+    worlds.rows.copy_(start.reshape(8, -1))
     worlds.measure()
     padded = torch.zeros(2, 2, worlds.num_lanes)
     padded[:, :, : start.shape[-1]] = control
     for _ in range(10):
         worlds.advance(padded)
-    return worlds.rows().clone()
+    return worlds.rows.clone()
 
 
 def test_products_stay_exact_when_torch_may_round_them() -> None:

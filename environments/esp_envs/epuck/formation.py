@@ -144,6 +144,8 @@ class Formation(BatchedTask):
         self.physics.advance(self._wheel_speeds(action))
         self._look()
         reward = rules.step_reward(self.settings, distance_before - self._distance, self._apart)
+        if not self.measures:
+            return self._per_world(reward), {}
         ended = self._time + 1 == self.spec.horizon
         metrics = self._measure(rules.length(self._position - before), ended)
         values = torch.from_numpy(np.array([*metrics.values()], np.float32))

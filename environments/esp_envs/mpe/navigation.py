@@ -229,11 +229,13 @@ class Navigation(ParticleTask):
             reward = paid * (ratio - 1) - ratio * touching
         else:
             reward = torch.addmm(paid.expand(agents, -1), worlds.pushes.abs(), touching, beta=ratio - 1, alpha=-ratio)
+        if not self.measures:
+            return reward, {}
         return reward, {
             "collisions": collisions,
             "collisions_per_agent": collisions * (2 / agents),
             "landmark_distance": distance / landmarks,
-            "coverage": (nearest < OCCUPIED_WITHIN).float().mean(0),
+            "coverage": (nearest < OCCUPIED_WITHIN).sum(0) / landmarks,
         }
 
 

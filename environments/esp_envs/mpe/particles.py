@@ -60,10 +60,11 @@ class ParticleWorlds:
     """W worlds of the same bodies.
 
     `physics` [2A + L, 2, W'] float32 has rows of the agents' velocities, the agents' positions, the landmarks'
-    positions, of which `velocity`, `position` and `entity` are views; W' is W padded up (see LANE_MULTIPLE). Code that
-    writes to it calls `measure` afterwards, for `squared_contact_distance` [contacts, W'] and
-    `squared_watched_distance` [watched, W'] of the pairs in `bodies`. `pushes` [A, contacts] are 1 and -1 where an
-    agent is the first or the second of a pair. All stay the same memory, so that a task may keep views.
+    positions, of which `velocity`, `position` and `entity` are views; W' is W padded up (see LANE_MULTIPLE), and `rows`
+    [2 (2A + L), W] has the real worlds alone. Code that writes to it calls `measure` afterwards, for
+    `squared_contact_distance` [contacts, W'] and `squared_watched_distance` [watched, W'] of the pairs in `bodies`.
+    `pushes` [A, contacts] are 1 and -1 where an agent is the first or the second of a pair. All stay the same memory,
+    so that a task may keep views.
     """
 
     def __init__(self, bodies: Bodies, num_worlds: int, device: torch.device, velocity_first: bool = True) -> None:
@@ -73,6 +74,7 @@ class ParticleWorlds:
         self.num_lanes = lanes_of(num_worlds)
         agents, lanes = bodies.num_agents, self.num_lanes
         self.physics = torch.zeros(2 * agents + bodies.num_landmarks, 2, lanes, device=device)
+        self.rows = self.physics.view(-1, lanes)[:, :num_worlds]
         self.velocity = self.physics[:agents]
         self.position = self.physics[agents : 2 * agents]
         self.entity = self.physics[agents:]
@@ -93,10 +95,6 @@ class ParticleWorlds:
         self._gain = _rows(torch.tensor(bodies.gain) * DT_S, lanes).unsqueeze(1).repeat(1, 2, 1).to(device)
         limit = None if bodies.max_speed is None else _rows(torch.tensor(bodies.max_speed), lanes).to(device)
         self._max_speed = limit
-
-    def rows(self) -> Tensor:
-        """Return the physics of the real worlds as a view of shape [2 (2A + L), W]."""
-        return self.physics.view(-1, self.num_lanes)[:, : self.num_worlds]
 
     def measure(self) -> None:
         """Compute the pair offsets and distances of the present positions."""

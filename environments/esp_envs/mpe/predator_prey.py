@@ -12,6 +12,7 @@ from torch import Tensor
 
 from esp_envs.base import BLIND, joined
 from esp_envs.batched import World
+from esp_envs.mpe.many import ManyWorlds
 from esp_envs.mpe.particles import Bodies
 from esp_envs.mpe.predator_prey_spec import PredatorPreySettings, predator_prey_spec
 from esp_envs.mpe.task import MOVES, ParticleTask, nearest_move, unit_disc
@@ -120,7 +121,7 @@ class PredatorPrey(ParticleTask):
         agents, half = predators + 1, self.settings.half_side
         pairs: list[tuple[int, int]] = []
         if not self.settings.many:
-            pairs += [(a, predators) for a in range(predators)]
+            pairs += [(a, predators) for a in range(predators)]  # first, where `_outcome` finds their distances
             pairs += itertools.combinations(range(predators), 2)
             pairs += itertools.product(range(agents), range(agents, agents + obstacles))
         return Bodies(
@@ -215,20 +216,23 @@ class PredatorPrey(ParticleTask):
         return flee(position[:predators], position[predators], BOUND * self.settings.half_side).unsqueeze(0)
 
     def _outcome(self) -> tuple[Tensor, dict[str, Tensor]]:
-        predators = self.settings.num_predators
-        position = self.worlds.position
-        offset = (position[:predators] - position[predators]).square_()
-        square = offset[:, 0] + offset[:, 1]
+        predators, worlds = self.settings.num_predators, self.worlds
+        position = worlds.position
+        if isinstance(worlds, ManyWorlds):
+            square = (position[:predators] - position[predators]).square_().sum(1)
+        else:
+            square = worlds.squared_contact_distance[:predators]
         touches = paid = _touches(square)
         if self.settings.reward_offset:
             paid = _touches(self._squared_to(position[predators:])[:predators, 0])
-        metrics = {"contact": touches.clamp_max(1.0), "touches": touches, "prey_distance": square.amin(0).sqrt()}
         reward = paid * TOUCH_REWARD
         if self._prey_learns:
             hunted = -reward - out_of_bounds(position[predators] / self.settings.half_side).sum(0)
             both = torch.cat([reward.expand(predators, -1), hunted.unsqueeze(0)])
             reward = hunted if self.settings.control == "prey" else both
-        return reward, metrics
+        if not self.measures:
+            return reward, {}
+        return reward, {"contact": touches.clamp_max(1.0), "touches": touches, "prey_distance": square.amin(0).sqrt()}
 
 
 def _touches(squared_distance: Tensor) -> Tensor:

@@ -111,9 +111,6 @@ class ParticleTask(BatchedTask):
         self.world = {field.name: view for field, view in zip(spec.state.fields, rows, strict=True)}
         self._control = torch.zeros(bodies.num_agents, 2, lanes, device=self.device)
         self._learner_control = self._control[self.first_learner : self.first_learner + spec.num_agents]
-        self._moves = torch.zeros(spec.num_agents, 1, lanes, dtype=torch.int8, device=self.device)
-        directions = [MOVES.points.index(p) for p in (LEFT, RIGHT, DOWN, UP)]
-        self._directions = torch.tensor(directions, dtype=torch.int8, device=self.device).view(1, 4, 1)
         self._points = torch.tensor(MOVES.points, device=self.device)
         self._extents = torch.tensor(bodies.extent, device=self.device).view(-1, 1, 1)
         gain = torch.tensor(bodies.gain, device=self.device).view(-1, 1, 1)
@@ -135,7 +132,10 @@ class ParticleTask(BatchedTask):
 
     @abstractmethod
     def _outcome(self) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the reward [N, W'] or [W'] and the metrics [W'] of the step just made; W' counts padded lanes."""
+        """Return the reward [N, W'] or [W'] of the step just made, and its metrics [W'] where `measures` is on.
+
+        W' counts padded lanes.
+        """
 
     def _chance(self, generator: torch.Generator) -> World:
         """Draw what else chance decides in the episodes of one seed, [E, ...] by name."""
@@ -164,25 +164,22 @@ class ParticleTask(BatchedTask):
         self._drive()
         self.worlds.advance(self._control, self._push, self.settings.mud)
         reward, metrics = self._outcome()
-        worlds, lead = self.worlds.num_worlds, self._worlds_shape
-        per_world = reward[:worlds].view(lead) if reward.dim() == 1 else self._by_world(reward)
-        return per_world, {name: value[:worlds].view(lead) for name, value in metrics.items()}
+        return self._by_world(reward), {name: self._by_world(value) for name, value in metrics.items()}
 
     def _seen(self) -> Observation:
-        rows = self.worlds.rows().t()
-        lead = (self.num_seeds, self.num_envs)
+        rows = self.worlds.rows.t()
         if self._readout is None:
             obs = self._observe(self.world).flatten(3)
         else:
-            obs = exact_matmul(rows, self._readout).view(*lead, self.spec.num_agents, -1)
-        return Observation(obs, rows.contiguous().view(*lead, -1))
+            obs = exact_matmul(rows, self._readout).view(*self._agents_shape, -1)
+        return Observation(obs, rows.contiguous().view(*self._worlds_shape, -1))
 
     def _put(self, state: Tensor) -> None:
-        self.worlds.rows().copy_(state.reshape(-1, self.spec.state.width).t())
+        self.worlds.rows.copy_(state.reshape(-1, self.spec.state.width).t())
         self.worlds.measure()
 
     def _to_save(self) -> dict[str, Tensor]:
-        return {"physics": self.worlds.rows()}
+        return {"physics": self.worlds.rows}
 
     def _take_back(self, saved: dict[str, Tensor]) -> None:
         for name, values in self._to_save().items():
@@ -196,12 +193,8 @@ class ParticleTask(BatchedTask):
 
     def _act(self, action: Tensor) -> None:
         learners, worlds = self.spec.num_agents, self.worlds.num_worlds
-        if self.settings.actions == "discrete":
-            self._moves[:, 0, :worlds] = action.reshape(worlds, learners).t()
-            chosen = (self._moves == self._directions).view(torch.int8)
-            self._learner_control.copy_(chosen[:, 1::2] - chosen[:, 0::2])
-        else:
-            self._learner_control[:, :, :worlds] = action.reshape(worlds, learners, 2).permute(1, 2, 0)
+        force = self._points.index_select(0, action.reshape(-1)) if self.settings.actions == "discrete" else action
+        self._learner_control[:, :, :worlds] = force.reshape(worlds, learners, 2).permute(1, 2, 0)
         if self.settings.action_turn_rad:
             self._learner_control.copy_(_turned(self._learner_control, self.settings.action_turn_rad))
 
@@ -229,8 +222,11 @@ class ParticleTask(BatchedTask):
 
     def _by_world(self, values: Tensor) -> Tensor:
         """Return the real worlds' part of [..., W'] as a view [S, E, ...]."""
-        real = values[..., : self.worlds.num_worlds].movedim(-1, 0)
-        return real.unflatten(0, (self.num_seeds, self.num_envs))
+        worlds = self.worlds
+        real = values if worlds.num_worlds == worlds.num_lanes else values[..., : worlds.num_worlds]
+        if real.dim() == 1:
+            return real.view(self._worlds_shape)
+        return real.movedim(-1, 0).unflatten(0, self._worlds_shape)
 
 
 def _turned(force: Tensor, angle: float) -> Tensor:
