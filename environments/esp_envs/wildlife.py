@@ -10,11 +10,11 @@ from pydantic import Field as Setting
 from pydantic import model_validator
 from torch import Tensor
 
-from esp_envs.batched import BatchedTask, Outcome, World
+from esp_envs.batched import BatchedTask, Outcome, World, to_others
 from esp_envs.errors import UserError
 from esp_envs.scene import DARK, Body, Scene, look
 from esp_envs.settings import Breaks, TaskSettings
-from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Discrete, Field, Items, Kind, TaskSpec, layout, others_of
+from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Discrete, Field, Items, Kind, TaskSpec, layout
 
 REST = (0.0, 0.0)
 MOVES = Discrete(Kind.VECTOR, (REST, UP, RIGHT, DOWN, LEFT), ("rest", "up", "right", "down", "left"))
@@ -149,7 +149,8 @@ class Wildlife(BatchedTask):
         pictures = all_pictures(settings.width, settings.height)
         # as wide as an observation, so that one copy of rows makes the observations
         self._rows = torch.nn.functional.pad(pictures, (0, 2 * (agents - 1))).to(device)
-        self._others = torch.tensor(others_of(agents), device=device)
+        basis = torch.eye(2 * agents, dtype=torch.float64, device=device)
+        self._others = to_others(basis.view(-1, agents, 2)).flatten(1)  # by which drones' cells give the ways to others
         lead = (self.num_seeds, num_envs)
         self.plan = torch.zeros(settings.horizon, *lead, agents + 2, 2, dtype=torch.int16, device=device)
         """[horizon, S, E, N + 2, 2], all that chance decides, drawn in advance: in each step the poacher's move, then
@@ -187,7 +188,8 @@ class Wildlife(BatchedTask):
         settings, agents = self.settings, self.settings.num_agents
         before = world["cells"]
         self._chance = self.plan[self._time].long()
-        after = self._wrap(before + torch.cat([self._points[action], self._chance[:, :, :1]], 2))
+        moves = self._points.index_select(0, action.flatten()).view(*action.shape, 2)
+        after = self._wrap(before + torch.cat([moves, self._chance[:, :, :1]], 2))
         drones = after[:, :, :agents]
         cell = ((drones + self._half) * self._step).sum(-1)
         bumped = self._busy.zero_().scatter_add_(-1, cell, torch.ones_like(cell)).gather(-1, cell) > 1
@@ -197,6 +199,8 @@ class Wildlife(BatchedTask):
         landed, helpers = self._trap(drones, poacher, bumped)
         self._captured = landed & (helpers > 0)
         reward = torch.where(self._captured, 1.0 + helpers, 0.0) - STEP_COST
+        if not self.measures:
+            return reward, {}
         return reward, {
             "captures": self._captured,
             "lone_landings": landed & (helpers == 0),
@@ -213,7 +217,7 @@ class Wildlife(BatchedTask):
         x, y = self._wrap(poacher - drones).unbind(-1)
         picture = (settings.height // 2 - y) * settings.width + x + settings.width // 2
         obs = self._rows.index_select(0, picture.flatten()).view(*picture.shape, -1)
-        others = drones[:, :, self._others] - drones.unsqueeze(3)
+        others = (drones.flatten(2).double() @ self._others).view(*picture.shape, -1, 2)
         if settings.convention == "corrected":
             others = self._wrap(others)
         obs[..., -2 * (settings.num_agents - 1) :] = others.flatten(-2)
