@@ -86,36 +86,41 @@ def _choices(*values: JsonValue) -> Dimension:
     return Dimension(choices=values)
 
 
-_HIDDEN = {"network.hidden": _choices([64, 64], [128, 128])}
+_NETWORK = {"network.hidden": _choices([64, 64], [128, 128]), "network.activation": _choices("tanh", "relu")}
 _PRIOR = {"prior.consistency_coef": _range(0.01, 1.0)}
+_GAMMA = _range(0.9, 0.995, log=False)
 _OFF_POLICY = {
     "learning_rate": _range(5e-4, 1e-2),
+    "gamma": _GAMMA,
     "td_lambda": _range(0.0, 0.95, log=False),
     "updates_per_episode": _choices(1, 2),
-    "epsilon_steps": _range(10_000, 200_000),
+    "num_envs": _choices(4, 8),
+    "epsilon_steps": _range(5_000, 200_000),
 }
 SPACES: Mapping[str, Space] = {
     "mappo": {
-        "mappo.learning_rate": _range(1e-4, 3e-3),
+        "mappo.learning_rate": _range(1e-4, 1e-2),
         "mappo.entropy_coef": _range(1e-3, 0.1),
-        "mappo.gae_lambda": _range(0.9, 0.99, log=False),
+        "mappo.gamma": _GAMMA,
+        "mappo.gae_lambda": _range(0.8, 0.99, log=False),
         "mappo.clip_epsilon": _range(0.1, 0.3, log=False),
         "mappo.num_epochs": _range(3, 15, log=False),
-        "mappo.num_minibatches": _choices(1, 2, 4, 8),
-        **_HIDDEN,
+        "mappo.num_minibatches": _choices(1, 2, 5, 10),
+        "mappo.num_envs": _choices(32, 64, 128),
+        **_NETWORK,
     },
     "maddpg": {
         **{f"maddpg.{name}": dimension for name, dimension in _OFF_POLICY.items()},
         "maddpg.actor_learning_rate": _range(5e-4, 1e-2),
         "maddpg.tau": _range(1e-3, 5e-2),
         "maddpg.output_penalty": _range(1e-4, 0.1),
-        **_HIDDEN,
+        **_NETWORK,
     },
     "qmix": {
         **{f"qmix.{name}": dimension for name, dimension in _OFF_POLICY.items()},
         "qmix.target_every": _range(25, 400),
         "qmix.replay_episodes": _choices(500, 1000, 5000),
-        **_HIDDEN,
+        **_NETWORK,
     },
 }
 """Unless the user names another one. The prior adds the weight of its loss."""

@@ -7,6 +7,7 @@ import re
 import pytest
 
 from esp_cli.algorithms.presets import ALGORITHMS
+from esp_cli.studies import symmetry
 from esp_cli.studies.run_set import StudyError
 from esp_cli.studies.tuning import TUNING_FORMAT, Point, Tuning, curve_of, fresh_study, score
 from esp_cli.studies.tuning_space import Dimension, default_space, read_space, space_of
@@ -49,12 +50,18 @@ def test_the_default_space_is_widened_to_hold_the_defaults_of_the_task():
     given = default_space("mappo")
     searched = tuning(task="navigation", algorithm="mappo", overrides={}, space=given).around_defaults()
     values = searched.default_values("esp", given)
-    assert (given["mappo.learning_rate"].high, values["mappo.learning_rate"]) == (3e-3, 4e-3)
-    assert searched.space["mappo.learning_rate"] == Dimension(low=1e-4, high=4e-3, log=True)
+    assert given["mappo.learning_rate"].holding(0.04) == Dimension(low=1e-4, high=0.04, log=True)
     assert searched.space["network.hidden"].choices == ([64], [64, 64], [128, 128])
     assert searched.space["mappo.entropy_coef"] == given["mappo.entropy_coef"]
     assert all(searched.space[name].encoded(value) is not None for name, value in values.items())
     assert Dimension(low=0.1, high=1.0, log=True).holding(0.0).low == 0.1, "no logarithm"
+
+
+@pytest.mark.parametrize("algorithm", symmetry.SPACES)
+def test_the_default_space_holds_all_that_the_benchmark_tries(algorithm):
+    space = default_space(algorithm)
+    for name, values in symmetry.SPACES[algorithm].items():
+        assert [value for value in values if space[f"{algorithm}.{name}"].encoded(value) is None] == []
 
 
 def test_an_algorithm_without_a_space_asks_for_one():
