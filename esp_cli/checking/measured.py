@@ -18,8 +18,6 @@ from esp_envs.errors import UserError
 from esp_envs.registry import task_class
 from esp_envs.views import worlds_of_role
 
-_HORIZON = 50  # steps of an episode, at most, where a task has such a setting: of longer ones the beginning
-
 
 def prepared(config: RunConfig) -> RunConfig:
     """Return a configuration with all that its prior leaves to be measured; others come back as they are.
@@ -74,10 +72,7 @@ class _Maker:
 
     @classmethod
     def of(cls, config: RunConfig) -> _Maker:
-        settings = dict(config.task_settings)
-        if isinstance(horizon := settings.get("horizon"), int):
-            settings["horizon"] = min(horizon, _HORIZON)
-        return cls(task_class(config.task), json.dumps(settings, sort_keys=True))
+        return cls(task_class(config.task), json.dumps(config.task_settings, sort_keys=True))
 
     def __call__(self, num_envs: int, seeds: Sequence[int]) -> Environment:
         return self.task(self.task.Settings(**json.loads(self.settings)), num_envs, generators_for(seeds))

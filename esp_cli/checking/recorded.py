@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 import zipfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from esp_envs.spec import Discrete, Spaces
 EPISODES = 2048
 STEPS = 8  # steps of each episode that are looked at
 _MOST_BYTES = 2**31
-_NEEDED, _OPTIONAL = ("obs", "action", "reward", "next_obs"), ("action_mask",)
+_NEEDED, _OPTIONAL = ("obs", "action", "reward", "next_obs"), ("action_mask", "terminated")
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,7 @@ class Transitions:
         action: [M, T, N] int64, or [M, T, N, width] float32.
         reward: [M, T, N].
         action_mask: [M, T, N, A] bool, the actions that were allowed; None where all always are.
+        terminated: [M, T, N] bool, whether the step ended the episode for good; None where none does.
     """
 
     obs: Tensor
@@ -43,10 +45,15 @@ class Transitions:
     reward: Tensor
     next_obs: Tensor
     action_mask: Tensor | None = None
+    terminated: Tensor | None = None
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Transitions:
+        """Return transitions with every tensor put through a function."""
+        return Transitions(**{name: function(part) for name, part in vars(self).items() if part is not None})
 
     def episodes(self, where: slice) -> Transitions:
         """Return some of the episodes."""
-        return Transitions(*(part[where] for part in vars(self).values() if part is not None))
+        return self.map(lambda x: x[where])
 
 
 def collect(
@@ -74,6 +81,7 @@ def collect(
             step = env.step(action)
             row: tuple[Tensor, ...] = (observation.obs, action, step.reward, step.reached.obs)
             row += () if observation.action_mask is None else (observation.action_mask,)
+            row += (step.terminated.unsqueeze(-1).expand_as(step.reward),) if env.spec.terminates else ()
             if rows:
                 row = tuple(
                     torch.where(over.view(*over.shape, *(1,) * (new.dim() - 2)), old, new)
@@ -90,13 +98,15 @@ def collect(
         torch.cat([torch.stack(column, 2).flatten(0, 1) for column in columns]).cpu()
         for columns in zip(*(zip(*rows, strict=True) for rows in found), strict=True)
     ]
-    return Transitions(*parts)
+    optional = (("action_mask", env.spec.masks), ("terminated", env.spec.terminates))
+    return Transitions(**dict(zip((*_NEEDED, *(name for name, given in optional if given)), parts, strict=True)))
 
 
 def outputs_of(data: Transitions) -> Tensor:
-    """Return what a regression predicts of each agent, [M, T, N, D + 1]: change, reward and any mask."""
+    """Return what a regression predicts of each agent, [M, T, N, D + 1]: change, reward, and any mask and end."""
     outputs = [data.next_obs - data.obs, data.reward.unsqueeze(-1)]
     outputs += [] if data.action_mask is None else [data.action_mask.float()]
+    outputs += [] if data.terminated is None else [data.terminated.float().unsqueeze(-1)]
     return torch.cat(outputs, -1)
 
 
@@ -112,6 +122,7 @@ def turned(data: Transitions, transform: Transform) -> Transitions:
         transform.per_agent(one(data.reward))[0],
         transform.obs(one(data.next_obs))[0],
         None if data.action_mask is None else transform.push_outputs(one(data.action_mask))[0],
+        None if data.terminated is None else transform.per_agent(one(data.terminated))[0],
     )
 
 
@@ -120,7 +131,8 @@ def read_transitions(path: Path, spaces: Spaces) -> Transitions:
 
     Args:
         path: of an .npz file with obs and next_obs [M, T, N, D], action [M, T, N] of integers or [M, T, N, width],
-            reward [M, T, N], and action_mask [M, T, N, A] where the task has masks; the axis T may be left out.
+            reward [M, T, N], and where the task has them action_mask [M, T, N, A] and terminated [M, T, N]; the axis T
+            may be left out.
         spaces: what the numbers are.
 
     Raises:
@@ -137,10 +149,11 @@ def read_transitions(path: Path, spaces: Spaces) -> Transitions:
         if array.dtype.kind not in ("iu" if integer else "fiub"):
             raise UserError(f"'{name}' of {path} holds {array.dtype}; save {'integers' if integer else 'numbers'}")
         tensor = torch.from_numpy(array.astype(np.int64 if integer else np.float32))
-        per_agent = name == "reward" or integer
+        per_agent = name in ("reward", "terminated") or integer
         tensors[name] = tensor.unsqueeze(1) if tensor.ndim == (2 if per_agent else 3) else tensor
-    mask = tensors.pop("action_mask", None)
-    return Transitions(**tensors, action_mask=None if mask is None or not whole else mask > 0)
+    mask, ends = tensors.pop("action_mask", None), tensors.pop("terminated", None)
+    allowed = None if mask is None or not whole else mask > 0
+    return Transitions(**tensors, action_mask=allowed, terminated=None if ends is None else ends > 0)
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:

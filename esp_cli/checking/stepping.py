@@ -72,6 +72,29 @@ def outcomes(
     return steps
 
 
+def followed(
+    env: Environment,
+    visited: Sequence[tuple[Tensor, Tensor]],
+    turned: Transform | Shift | None,
+    seed: int,
+    until: float,
+) -> list[Step]:
+    """Return the steps of the episodes that begin in the first moment's states, one for each moment's actions.
+
+    Clocks run on, and what no state holds builds up; arguments and results as of `outcomes`.
+    """
+    _begin(env, len(visited), turned, seed)
+    env.reset()
+    state, steps = visited[0][0], list[Step]()
+    seen = env.set_state(state if turned is None else turned.state(state))
+    for _, action in visited:
+        stop_at(until)
+        step = env.step(action if turned is None else turned.action(action))
+        steps.append(replace(step, next=seen, final=step.reached, metrics={}))
+        seen = step.next
+    return steps
+
+
 def _begin(env: Environment, steps: int, turned: Transform | Shift | None, seed: int) -> None:
     """Let all that chance decides follow from a seed, and agents of other roles act alike in each run, but turned."""
     worlds = env.inner if isinstance(env, RoleView) else env

@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from esp_cli.checking import paired, transitions
+from esp_cli.checking import comparison, paired, transitions
 from esp_cli.checking.candidates import candidates, named, refused
 from esp_cli.checking.recorded import Transitions, collect
 from esp_cli.checking.shifting import SHIFT, Shift
@@ -22,7 +22,7 @@ from esp_envs.spec import Spaces
 from esp_envs.views import RoleView
 
 PAIRED, TRANSITIONS = "paired states", "transitions"
-TOLERATED = {PAIRED: paired.TOLERATED, TRANSITIONS: transitions.TOLERATED}
+TOLERATED = {PAIRED: comparison.TOLERATED, TRANSITIONS: transitions.TOLERATED}
 """Standard deviations that a field may be off and yet hold, by method."""
 _COPIES, _FOREIGN = 256, 64  # most worlds of a task that takes no state, and of a simulator of others that does
 _EPISODES = 4096

@@ -36,7 +36,9 @@ FEWEST = 64  # episodes (or single transitions) below which nothing can be told
 TOLERATED = 0.2  # standard deviations of a field that a step from the image may differ from the step's image
 _SEEN = 0.1  # squared share of the tolerance from which a gap beyond chance is a breaking: predictors err
 _DOUBTFUL = 4.0  # standard errors from which such a gap is no breaking yet, but leaves an element uncovered
-_HIDES = 0.25  # share of the variance of rewards from which on the rarest hundredth of them hides what is usual
+_HIDES, _CARRIES = 0.25, 0.9
+"""Shares of the variance of rewards that the rarest hundredth of them has: from the first on it is left out, as it
+hides what is usual, from the second on what is left is too little to say that rewards hold."""
 _MOST_ROWS = 1 << 15  # steps of agents that are looked at, at most; of more episodes every k-th step
 _FEWEST_INSIDE = 0.5  # least share of images that lie where transitions do to show something; these are judged
 _PREFERS, _ELSEWHERE = 0.05, 0.5
@@ -55,14 +57,14 @@ def check_transitions(
 
     Each episode counts once. `watch` is told of how many elements of how many are judged; `until` as in `verdicts_of`.
     """
-    data = Transitions(*(x.float() if x.is_floating_point() else x for x in vars(data).values() if x is not None))
+    data = data.map(lambda x: x.float() if x.is_floating_point() else x)
     _refuse_what_says_nothing(spaces, data)
-    data = replace(data, reward=_without_tails(data.reward))
+    usual = _without_tails(data.reward)
+    is_little = usual is not data.reward and bool(usual.var() < (1 - _CARRIES) * data.reward.var())
+    data = replace(data, reward=usual)
     stride = -(-len(data.obs) * data.obs.shape[1] * spaces.num_agents // _MOST_ROWS)
-    thinned = Transitions(*(part[:, ::stride] for part in vars(data).values() if part is not None))
-    half = len(data.obs) // 2
-    parts = thinned.episodes(slice(half)), thinned.episodes(slice(half, None))
-    first = Transitions(*(part[:, :1] for part in vars(data).values() if part is not None))
+    thinned, half = data.map(lambda x: x[:, ::stride]), len(data.obs) // 2
+    parts, first = (thinned.episodes(slice(half)), thinned.episodes(slice(half, None))), data.map(lambda x: x[:, :1])
 
     @cache
     def halves() -> list[_Half]:
@@ -70,9 +72,15 @@ def check_transitions(
         return [_Half(spaces, controls, fitted, held) for fitted, held in (parts, parts[::-1])]
 
     def judge(element: Element) -> ElementVerdict:
-        return _judge(element, spaces, halves(), first)
+        found = _judge(element, spaces, halves(), first)
+        told = (_untold(field) if is_little and field.field == "reward" else field for field in found.fields)
+        return replace(found, fields=tuple(told))
 
     return verdicts_of(elements, judge, lambda element: is_declared(element, spaces), watch, until)
+
+
+def _untold(field: FieldVerdict) -> FieldVerdict:
+    return replace(field, outcome="not covered", p_value=1.0) if field.outcome == "holds" else field
 
 
 def _judge(element: Element, spaces: Spaces, halves: Sequence[_Half], first: Transitions) -> ElementVerdict:
@@ -85,10 +93,9 @@ def _judge(element: Element, spaces: Spaces, halves: Sequence[_Half], first: Tra
     verdicts = []
     for name in halves[0].fields:
         alone, squares, planted = (torch.cat([one.fields[name][k] for one in compared]) for k in range(3))
-        still = float(halves[0].spread[halves[0].fields[name]].sum()) < STILL**2
-        never = name == "reward" and not any(half.held.reward.any() for half in halves)
-        # that it never changes is its law where it is seen; that of a reward that never came is unknown
-        of_nothing = concluded(name, 0.0, 0.0, broken=False, p_value=float(never))
+        still = all(float(half.spread[half.fields[name]].sum()) < STILL**2 for half in halves)
+        # that it never changes is its law where it is seen; that of rewards and ends which never came is unknown
+        of_nothing = concluded(name, 0.0, 0.0, broken=False, p_value=float(_never_came(name, halves)))
         verdicts.append(of_nothing if still else _judged(name, alone, squares, planted[:, counts]))
     found = ElementVerdict(element.name, declared, tuple(verdicts))
     image = turned(first, transform)
@@ -99,6 +106,12 @@ def _judge(element: Element, spaces: Spaces, halves: Sequence[_Half], first: Tra
         reason = f"the first actions differ from their image by {preference:.2f} s.d."
         return ElementVerdict(element.name, declared, (), reason)
     return found
+
+
+def _never_came(name: str, halves: Sequence[_Half]) -> bool:
+    """Return whether what never changed may do so elsewhere: an end, or a reward unless episodes were seen to end."""
+    ends = any(half.held.terminated is not None and bool(half.held.terminated.any()) for half in halves)
+    return name == "end" or (name == "reward" and not (ends and any(bool(half.held.reward.any()) for half in halves)))
 
 
 def _judged(name: str, alone: Tensor, squares: Tensor, planted: Tensor) -> FieldVerdict:
@@ -136,7 +149,9 @@ class _Half:
         self.spread = self._here.true.flatten(0, 2).var(0)
         self.fields = {f"obs.{name}": where for name, where in spaces.observation.slices().items()}
         self.fields |= {"reward": slice(width, width + 1)}
-        self.fields |= {"action mask": slice(width + 1, None)} if self._width > width + 1 else {}
+        masks = self._width - (fitted.terminated is not None)
+        self.fields |= {"action mask": slice(width + 1, masks)} if masks > width + 1 else {}
+        self.fields |= {"end": slice(masks, self._width)} if masks < self._width else {}
 
     @torch.no_grad()
     def compared(self, transform: Transform) -> _Compared:
@@ -203,6 +218,8 @@ def _refuse_what_says_nothing(spaces: Spaces, data: Transitions) -> None:
     shapes = {"obs": seen, "action": (*lead, *width), "reward": lead, "next_obs": seen}
     if data.action_mask is not None and isinstance(spaces.action, Discrete):
         shapes["action_mask"] = (*lead, spaces.action.count)
+    if data.terminated is not None:
+        shapes["terminated"] = lead
     for name, shape in shapes.items():
         found = tuple(getattr(data, name).shape)
         if found != shape or len(lead) != 3 or 0 in found[1:]:

@@ -261,7 +261,7 @@ class Symmetry(Draws):
 
         data = source if isinstance(source, Transitions) else collect(source)
         if self.spaces.num_agents == 1 and data.reward.dim() == 2:
-            data = Transitions(**{name: value.unsqueeze(2) for name, value in vars(data).items() if value is not None})
+            data = data.map(lambda x: x.unsqueeze(2))
         lead_of(self.spaces, data.obs if self.spaces.num_agents > 1 else data.obs.squeeze(2))
         spaces = replace(self.spaces, symmetry=self.group)
         return check_transitions(spaces, data, candidates(spaces, transforms or self.group))

@@ -19,8 +19,8 @@ from esp_cli.checking import (
     measured,
     named,
 )
+from esp_cli.checking.comparison import state_by_state
 from esp_cli.checking.measured import prepared
-from esp_cli.checking.paired import _verdict
 from esp_cli.checking.recorded import read_transitions
 from esp_cli.checking.verdicts import LATE, ElementVerdict, FieldVerdict, Late, chance, concluded, verdicts_of
 from esp_cli.symmetry import Element, parse_elements, transform_set
@@ -247,7 +247,7 @@ def test_one_number_that_is_not_finite_hides_no_gap() -> None:
     x = torch.randn(500, 1, generator=torch.Generator().manual_seed(0))
     hole = x.clone()
     hole[7] = torch.nan
-    found = _verdict("reward", hole, x, x + 3, hole)
+    found = state_by_state("reward", *({"reward": side} for side in (hole, x, x + 3, hole)))
     assert (found.outcome, found.gap > 1) == ("broken", True)
 
 

@@ -1,0 +1,174 @@
+"""Compare a step from a state with the step from the transformed state, as distributions.
+
+From each state s and joint action a, two runs with chance of their own give outcomes X and X', transformed by g; two
+runs from L_g s with K_g a give Y and Y'. The energy distance
+
+    E |X - Y| - (E |X - X'| + E |Y - Y'|) / 2
+
+is 0 if and only if both have one distribution (eq. 5 and 6), for noise of any kind. A random prey or a noisy sensor is
+thus no false alarm, and no task has to turn its own noise along.
+
+Two cases need no statistics. A field without chance is judged state by state: one that differs by more than rounding is
+a proof. And where a run from the images that meets the chance of X gives X itself, both have one distribution, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from esp_cli.checking.shifting import Shift
+from esp_cli.checking.verdicts import NEGLIGIBLE, RANK, SIGNIFICANT, FieldVerdict, chance, concluded
+from esp_cli.symmetry import Transform
+from esp_envs.base import Observation, Step
+from esp_envs.spec import Layout, TaskSpec
+
+TOLERATED = 0.15  # standard deviations that a field with chance may be off, where it is not found broken
+FEW = 0.05
+"""Share of the states further out that may differ: in some that play never reaches, contacts are solved in the order
+in which a simulator numbers them."""
+_BOUND = 0.05  # where the bounded distance levels off, in standard deviations of the field
+_ROUNDINGS, _UNCLEAR = 10.0, 0.05
+"""How often what rounding does may be exceeded without being a mismatch, and the share of the states that differ by no
+more than that, from which nothing is said."""
+_SMALL = 0.01
+"""Share of a field's spread below which a number's own spread, or that of its changes, is what counts: else a large
+number would hide a small one beside it, and a large world slow steps."""
+_ULPS = 1e-6  # rounding of a number as a share of it, at least
+Outcomes = dict[str, Tensor]  # what a step gives, by field: [M, numbers]
+
+
+def state_by_state(
+    name: str, first: Outcomes, second: Outcomes, alike: Outcomes, near: Outcomes
+) -> FieldVerdict | None:
+    """Judge one field from outcomes [M, numbers] state by state, where that tells; else return None.
+
+    `first` are transformed outcomes, `second` the same with other chance, `alike` outcomes from the transformed states
+    with the chance of `first`, `near` transformed ones from states that differ by about a rounding, with that chance.
+    """
+    x, x2, y, close = first[name], second[name], alike[name], near[name]
+    own, *others, image = (side.isfinite().all(1) for side in (x, x2, close, y))
+    if share := float((torch.stack(others) == own).all(0).logical_and(image != own).float().mean()):
+        return FieldVerdict(name, "broken", share, 0.0, share=share)  # numbers on one side alone
+    before = first.get(f"start {name}", x)
+    (x, x2, y), known = _known(x, x2, y)
+    if not len(x):
+        return FieldVerdict(name, "not covered", float("nan"), float("nan"))
+    scale = _scale(x, y)
+    rounding = torch.maximum((x - close[known]).abs().amax(1).nan_to_num(), _ULPS * x.abs().amax(1))
+    units = _units(x, x - before[known], scale)
+    found = _each_state(name, (x - y).abs(), _ROUNDINGS * rounding, scale, units)
+    is_certain = float((x - x2).abs().max()) <= NEGLIGIBLE * scale
+    return found if is_certain or found.outcome == "holds" else None
+
+
+def beside_what_is_seen(name: str, sides: Sequence[Outcomes], near: Outcomes) -> FieldVerdict | None:
+    """Find a field with chance broken by how often runs agree in it and in all that is seen before the step.
+
+    Episodes may draw a goal that no state holds and that agents see. Then rewards may be alike by themselves, and yet
+    not beside the goal. Distances of continuous chance never agree, and of these this says nothing.
+    """
+    names = dict.fromkeys([*(one for one in near if one.startswith("start obs.")), name])
+    rows, _ = _known(*(torch.cat([side[one] for one in names], 1) for side in (*sides, near)))
+    tolerance = NEGLIGIBLE * rows[0].std(0).clamp_min(1e-6)
+    is_clear = (_ROUNDINGS * (rows[0] - rows[-1]).abs() <= tolerance).all(1)
+    x, x2, y, y2 = (side[is_clear] for side in rows[:4])
+    within, across = ((x - x2, y - y2), (x - y, x2 - y2, x - y2, x2 - y))
+    samples = _excess(lambda gap: (gap.abs() > tolerance).any(1, keepdim=True).double(), within, across)
+    share, error = float(samples.mean()), float(samples.std()) / max(1, len(samples)) ** 0.5
+    return FieldVerdict(name, "broken", share, error, share=share) if share > max(SIGNIFICANT * error, FEW) else None
+
+
+def by_distances(name: str, x: Tensor, x2: Tensor, y: Tensor, y2: Tensor) -> FieldVerdict:
+    """Judge one field with chance from four runs [M, numbers]: x and x2 transformed, y and y2 from images."""
+    (x, x2, y, y2), _ = _known(x, x2, y, y2)
+    if not len(x):
+        return FieldVerdict(name, "not covered", float("nan"), float("nan"))
+    scale = _scale(x, y)
+    within, across = ((x - x2, y - y2), (x - y, x2 - y2, x - y2, x2 - y))
+    # The second distance is bounded, so that rare large chance (a touch, a capture) hides no small constant fault.
+    bound = _BOUND * scale
+    distances = (Tensor.abs, lambda gap: bound * -torch.expm1(-gap.abs() / bound))
+    tests = [_excess(distance, within, across) for distance in distances]
+    tests.append((x + x2 - y - y2) / 2)
+    samples = torch.cat(tests, 1).double() / scale
+    gaps, errors = samples.mean(0).abs(), samples.std(0) / len(samples) ** 0.5
+    broken = (gaps > SIGNIFICANT * errors) & (gaps > NEGLIGIBLE)
+    worst = int(torch.where(broken, gaps, gaps * (not broken.any())).argmax())
+    gap, error = float(gaps[worst]), float(errors[worst])
+    return concluded(name, gap, error, bool(broken.any()), chance(gap, TOLERATED, error))
+
+
+def _known(*sides: Tensor) -> tuple[list[Tensor], Tensor]:
+    """Return the rows that are finite on all sides, and which these are."""
+    known = torch.isfinite(torch.stack(sides)).all(-1).all(0)
+    return [side[known] for side in sides], known
+
+
+def _scale(x: Tensor, y: Tensor) -> float:
+    return max(float(torch.cat([x, y]).std(0).max()), 1e-6)
+
+
+def _units(x: Tensor, change: Tensor, scale: float) -> Tensor:
+    """Return in which unit each number of a field [M, numbers] is compared: of its spread `scale`, or a smaller one."""
+    own = torch.where(change.any(0), torch.minimum(x.std(0), change.nan_to_num().std(0)), x.std(0))
+    return torch.where(own < _SMALL * scale, own.clamp_min(NEGLIGIBLE * scale), scale).clamp_min(1e-6)
+
+
+def _each_state(name: str, apart: Tensor, rounding: Tensor, scale: float, units: Tensor) -> FieldVerdict:
+    """Judge a field without chance by how far apart the two sides are, [M, numbers], and rounding could be, [M]."""
+    unlike = (apart > NEGLIGIBLE * scale).any(1)
+    differ = ((apart > NEGLIGIBLE * units) & (apart > rounding.unsqueeze(1))).any(1)
+    share, unclear = float(differ.float().mean()), float((unlike & ~differ).float().mean())
+    gap = float(((apart / units).amax(1) * differ).mean())
+    return concluded(name, gap, 0.0, bool(differ.any()), float(unclear > _UNCLEAR), share)
+
+
+def _excess(distance: Callable[[Tensor], Tensor], within: Sequence[Tensor], across: Sequence[Tensor]) -> Tensor:
+    """Return by how much outcomes of the two sides lie further apart than those of one side [M, 1]."""
+    apart = torch.stack([distance(gap) for gap in across]).mean(0)
+    own = torch.stack([distance(gap) for gap in within]).mean(0)
+    return (apart - own).mean(1, keepdim=True)
+
+
+def merged(verdicts: Sequence[FieldVerdict]) -> list[FieldVerdict]:
+    """Keep one verdict for each field: the start's and the reached observation are of one field."""
+    best: dict[str, FieldVerdict] = {}
+    for verdict in verdicts:
+        name = verdict.field.removeprefix("start ")
+        renamed = replace(verdict, field=name)
+        known = best.get(name)
+        if known is None or (RANK[renamed.outcome], renamed.gap) > (RANK[known.outcome], known.gap):
+            best[name] = renamed
+    return list(best.values())
+
+
+def by_field(steps: Sequence[Step], spec: TaskSpec, transform: Transform | Shift | None) -> Outcomes:
+    """Return everything that the steps gave by field, transformed."""
+    parts: dict[str, list[Tensor]] = {}
+
+    def add(prefix: str, layout: Layout, rows: Tensor) -> None:
+        for name, where in layout.slices().items():
+            parts.setdefault(prefix + name, []).append(rows[..., where].flatten(0, 1).flatten(1))
+
+    for step in steps:
+        for prefix, seen in (("start ", step.next), ("", step.final)):
+            assert isinstance(seen, Observation)
+            if prefix and not bool(seen.obs.isfinite().any()):
+                continue  # a simulator of others does not say what is seen before a step
+            add(f"{prefix}obs.", spec.observation, seen.obs if transform is None else transform.obs(seen.obs))
+            if not spec.is_joint:
+                add(f"{prefix}state.", spec.state, seen.state if transform is None else transform.state(seen.state))
+            if seen.action_mask is not None:
+                mask = seen.action_mask if transform is None else transform.push_outputs(seen.action_mask)
+                parts.setdefault(f"{prefix}action mask", []).append(mask.float().flatten(0, 1).flatten(1))
+            if seen.alive is not None:
+                alive = seen.alive if transform is None else transform.per_agent(seen.alive)
+                parts.setdefault(f"{prefix}alive", []).append(alive.float().flatten(0, 1))
+        reward = step.reward if transform is None else transform.per_agent(step.reward)
+        parts.setdefault("reward", []).append(reward.flatten(0, 1))
+        parts.setdefault("end", []).append(step.terminated.float().flatten(0, 1).unsqueeze(-1))
+    return {name: torch.cat(rows) for name, rows in parts.items()}

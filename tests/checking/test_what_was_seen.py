@@ -1,0 +1,158 @@
+"""What no single step from a state shows is found in later steps; what data could not have refused does not hold."""
+
+from typing import ClassVar
+
+import pytest
+import torch
+
+from esp_cli.checking import check_symmetry
+from esp_envs import BatchedTask, Field, Kind, generators_for, layout
+from esp_envs.settings import TaskSettings
+from esp_envs.spec import Continuous, Items, TaskSpec
+
+
+class Settings(TaskSettings):
+    horizon: int = 25
+
+
+class Point(BatchedTask):
+    """One agent in the plane; it is paid for being near the middle. All turns and mirrors hold."""
+
+    Settings = Settings
+    size, speed, more, ends, hides = 1.0, 0.1, (), False, ()
+    states: ClassVar[bool] = True
+
+    def _describe(self):
+        place = Field("position", Kind.VECTOR, 1, "length")
+        return TaskSpec(
+            name="point",
+            version=1,
+            convention="own",
+            num_agents=1,
+            horizon=self.settings.horizon,
+            observation=layout(place, *self.more),
+            state=layout(Field("position", Kind.VECTOR, 1, "length", Items.AGENTS)),
+            action=Continuous(layout(Field("force", Kind.VECTOR))),
+            symmetry="d4",
+            settings={},
+            terminates=self.ends,
+            hidden=self.hides,
+        )
+
+    def _start(self, generator):
+        place = self.size * self.draw(1, 2, generator=generator)
+        return {"position": place, "before": torch.zeros_like(place)}
+
+    def _advance(self, world, action):
+        world["position"] = world["position"] + self.moved(world, action)
+        world["before"] = action
+        return self.paid(world["position"][:, :, 0]), {}
+
+    def _observe(self, world):
+        return world["position"]
+
+    def moved(self, world, action):
+        return self.speed * action
+
+    def paid(self, place):
+        return -place.norm(dim=-1)
+
+    def settable(self):
+        return self.states
+
+
+class Delayed(Point):  # the action before this one moves, along x more
+    hides = ("previous action",)
+
+    def moved(self, world, action):
+        return 0.1 * world["before"] * torch.tensor([2.0, 0.5])
+
+
+class Paid(Point):  # in the last step for the place along x
+    def paid(self, place):
+        return super().paid(place) + 10 * place[..., 0] * (self._time == self.settings.horizon - 1)
+
+
+class Slow(Point):  # steps of millimetres in a field of 100 m, with a wind
+    size, speed = 50.0, 0.005
+
+    def moved(self, world, action):
+        return self.speed * (action + torch.tensor([0.5, 0.0]))
+
+
+class Beside(Point):  # a flag beside a number that is a thousand times as large
+    more = (Field("numbers", Kind.SCALAR, 2),)
+
+    def _observe(self, world):
+        place = world["position"]
+        numbers = [1000 * place.norm(dim=-1, keepdim=True), 0.2 * (place[..., :1] > 0)]
+        return torch.cat([place, *numbers], -1)
+
+
+class Cost(Point):  # a goal that play never reaches, and a cost in each step
+    def paid(self, place):
+        return torch.where(place[..., 0] > 30, 100.0, -1.0)
+
+
+class NoEnd(Point):  # an end where play never goes
+    ends = True
+
+    def _ended(self, world):
+        return world["position"][:, :, 0, 0] > 30
+
+
+class End(NoEnd):
+    def _ended(self, world):
+        return world["position"][:, :, 0, 0] > 0.9
+
+
+class Seldom(Point):  # nearly all reward is in one step of five hundred
+    def paid(self, place):
+        near = (place - torch.tensor([0.7, 0.0])).norm(dim=-1) < 0.05
+        return torch.where(near, 100.0, 0.1 * super().paid(place))
+
+
+def verdict(task, element, from_transitions=False):
+    report = check_symmetry(lambda n, seeds: task(Settings(), n, generators_for(seeds)), element, from_transitions)
+    (found,) = report.elements
+    return found.outcome, {field.field for field in found.fields if field.outcome == found.outcome}
+
+
+@pytest.mark.parametrize(
+    ("task", "field"), [(Delayed, "reward"), (Paid, "reward"), (Slow, "obs.position"), (Beside, "obs.numbers")]
+)
+def test_a_breaking_is_found_that_builds_up_later_or_is_small_beside_other_numbers(task, field):
+    outcome, fields = verdict(task, "rot90")
+    assert (outcome, field in fields) == ("broken", True)
+
+
+@pytest.mark.parametrize("task", [Point, Paid, Slow, Beside, Delayed, End])
+def test_mirrors_that_are_left_hold(task):
+    mirror = {Point: "rot90"}.get(task, "flip-x")
+    assert verdict(task, mirror)[0] == "holds"
+
+
+class Alone(Delayed):  # of whose later steps nobody knows how they go on
+    ends = True
+
+    def _ended(self, world):
+        return world["position"][:, :, 0].norm(dim=-1) > 1
+
+
+def test_what_the_state_leaves_out_is_not_covered_where_no_later_step_tells():
+    assert verdict(Alone, "flip-x") == ("not covered", set())
+
+
+@pytest.mark.parametrize(("task", "field"), [(Cost, "reward"), (NoEnd, "end")])
+@pytest.mark.parametrize("from_transitions", [False, True])
+def test_rewards_and_ends_that_never_came_are_not_covered(task, field, from_transitions):
+    assert verdict(task, "rot90", from_transitions) == ("not covered", {field})
+
+
+def test_transitions_show_ends():
+    assert verdict(End, "rot90", from_transitions=True) == ("broken", {"end"})
+    assert verdict(End, "flip-x", from_transitions=True)[0] == "holds"
+
+
+def test_rewards_that_nearly_all_lie_in_the_rarest_hundredth_are_not_covered():
+    assert verdict(Seldom, "rot90", from_transitions=True) == ("not covered", {"reward"})
