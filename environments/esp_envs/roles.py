@@ -84,8 +84,9 @@ def spec_with_roles(roles: Sequence[Role], *, symmetry: str, state: Layout | Non
 
 
 def without_agents(transforms: str) -> str:
-    """Return transforms for a role of one agent, which changes places with nobody: "d4" for "d4*agents"."""
-    return "*".join(factor for factor in transforms.split("*") if factor != "agents")
+    """Return transforms for a role of one agent, which changes places with nobody: "d4" for "d4*agents,agents"."""
+    products = (part.strip().split("*") for part in transforms.split(","))
+    return ",".join(filter(None, ("*".join(f for f in factors if f != "agents") for factors in products)))
 
 
 def _widest(actions: Sequence[ActionSpace]) -> ActionSpace:

@@ -21,6 +21,7 @@ MOVES = Discrete(Kind.VECTOR, (REST, UP, RIGHT, DOWN, LEFT), ("rest", "up", "rig
 """In the order of van der Pol's code; the meaning of each is the way to the next cell."""
 STEP_COST = 0.05  # what a step costs the whole team
 PIXELS = 3  # along a side of a cell in a drone's picture
+_FEW = 16  # drones up to which one matrix product is the fastest way to the places of others
 
 
 class WildlifeSettings(TaskSettings):
@@ -149,8 +150,8 @@ class Wildlife(BatchedTask):
         pictures = all_pictures(settings.width, settings.height)
         # as wide as an observation, so that one copy of rows makes the observations
         self._rows = torch.nn.functional.pad(pictures, (0, 2 * (agents - 1))).to(device)
-        basis = torch.eye(2 * agents, dtype=torch.float64, device=device)
-        self._others = to_others(basis.view(-1, agents, 2)).flatten(1)  # by which drones' cells give the ways to others
+        basis = torch.eye(2 * min(agents, _FEW), dtype=torch.float64, device=device)
+        self._others = to_others(basis.view(len(basis), -1, 2)).flatten(1)  # turns cells of drones into ways to others
         lead = (self.num_seeds, num_envs)
         self.plan = torch.zeros(settings.horizon, *lead, agents + 2, 2, dtype=torch.int16, device=device)
         """[horizon, S, E, N + 2, 2], all that chance decides, drawn in advance: in each step the poacher's move, then
@@ -217,7 +218,10 @@ class Wildlife(BatchedTask):
         x, y = self._wrap(poacher - drones).unbind(-1)
         picture = (settings.height // 2 - y) * settings.width + x + settings.width // 2
         obs = self._rows.index_select(0, picture.flatten()).view(*picture.shape, -1)
-        others = (drones.flatten(2).double() @ self._others).view(*picture.shape, -1, 2)
+        if settings.num_agents <= _FEW:
+            others = (drones.flatten(2).double() @ self._others).view(*picture.shape, -1, 2)
+        else:
+            others = to_others(drones)
         if settings.convention == "corrected":
             others = self._wrap(others)
         obs[..., -2 * (settings.num_agents - 1) :] = others.flatten(-2)

@@ -49,7 +49,10 @@ class MaddpgConfig(ExploringConfig):
     output_penalty: float = Field(1e-3, ge=0, description="weight of the mean square of the actor's outputs")
 
     def without_effect(self, network: NetworkConfig, spec: Callable[[], TaskSpec]) -> frozenset[str]:
-        return frozenset() if isinstance(spec().action, Discrete) else frozenset({"actor_gradient"})
+        own = spec()
+        idle = frozenset() if isinstance(own.action, Discrete) else frozenset({"actor_gradient"})
+        joint = own.shared_reward and type(network).joint_critic is not NetworkConfig.joint_critic
+        return idle | {"critic_activation"} if joint else idle
 
 
 class Maddpg(ExploringLearner):

@@ -10,7 +10,7 @@ An agent that has ended adds nothing: its value enters the mixer as 0. (PyMARL f
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import MappingProxyType
 
 import torch
@@ -41,6 +41,10 @@ class QmixConfig(ExploringConfig):
     hyper_width: int = Field(64, ge=1, le=1024, description="hidden units of the hypernetwork")
     double_q: bool = Field(True, description="the online network chooses the next action, the target network values it")
     target_every: int = Field(100, ge=1, description="gradient steps between hard copies into the target networks")
+
+    def without_effect(self, network: NetworkConfig, spec: Callable[[], TaskSpec]) -> frozenset[str]:
+        own = type(network).mixer is not NetworkConfig.mixer  # which has no hypernetwork
+        return frozenset({"hyper_width"}) if own else frozenset()
 
 
 # orthogonal gain of the utility network's last layer: the first values are small beside standardised rewards

@@ -14,6 +14,8 @@ from esp_cli.networks.contract import NetworkConfig
 from esp_cli.networks.policy import Policy
 from esp_cli.networks.roles import RolesPolicy
 from esp_cli.prior import PriorConfig
+from esp_cli.symmetry import Group
+from esp_cli.symmetry.admission import admitted_elements, unrestricted
 from esp_envs.base import Environment
 from esp_envs.roles import without_agents
 from esp_envs.spec import TaskSpec
@@ -70,6 +72,10 @@ class RolesLearner(Learner):
         if role.num_agents == 1:
             rest = without_agents(prior.transforms)
             prior = prior.model_copy(update={"transforms": rest} if rest else {"kind": "none"})
+        if prior.weights and prior.kind != "none":
+            elements = admitted_elements(prior.transforms, unrestricted(role))
+            names = set() if isinstance(elements, Group) else {element.name for element in elements}
+            prior = prior.model_copy(update={"weights": {n: w for n, w in prior.weights.items() if n in names}})
         if getattr(config, "critic_input", None) == "observations" and role.joint_fields is not None:
             config = config.model_copy(update={"critic_input": "state"})  # which is the observations of all roles
         return self._cls(view, config, network, prior, self._own[name], self._of_prior[name])

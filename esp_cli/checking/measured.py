@@ -16,6 +16,7 @@ from esp_cli.training.config import RunConfig
 from esp_envs.base import Environment, generators_for
 from esp_envs.errors import UserError
 from esp_envs.registry import task_class
+from esp_envs.roles import without_agents
 from esp_envs.views import worlds_of_role
 
 
@@ -88,7 +89,8 @@ def _breaking(make_worlds: _Maker, transforms: str) -> tuple[tuple[str, float], 
     """Return by how many deviations each element's worst field is off in any role; infinite where nobody knows."""
     spec, gaps = make_worlds(1, [0]).spec, dict[str, float]()
     for role in spec.roles or (spec,):
-        elements = admitted_elements(transforms, unrestricted(role))  # what is weighed need not be declared
+        own = transforms if role.num_agents > 1 else without_agents(transforms)
+        elements = admitted_elements(own, unrestricted(role)) if own else ()  # what is weighed need not be declared
         if isinstance(elements, Group):
             raise UserError(
                 f"a prior that is auto or measured weighs each element, but '{transforms}' is sampled; choose a "

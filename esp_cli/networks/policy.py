@@ -38,7 +38,7 @@ class Policy(nn.Module):
         self.num_agents = spec.num_agents
         self.head = head
         head.masks = spec.masks
-        head.compiled = getattr(network, "compiled", False) is True
+        head.compiled = getattr(network, "compiled", False) is True and not getattr(network, "layer_norm", False)
         if head.compiled:
             begin("choices")
         inputs = spec.observation.width + num_extra

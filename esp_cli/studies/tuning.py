@@ -59,9 +59,10 @@ class Tuning(Strict):
         return {name: config[sections.get(section, section)].get(key) for name, (section, key) in places.items()}
 
     def around_defaults(self) -> Tuning:
-        """Return a search whose space holds the default settings too, which trial 0 then has."""
+        """Return a search whose space holds the default settings too, which trial 0 then has, and no others."""
         values = self.default_values(self.priors[0], self.space)
-        return self.model_copy(update={"space": {name: d.holding(values[name]) for name, d in self.space.items()}})
+        own = {name: d.holding(values[name]) for name, d in self.space.items() if values[name] is not None}
+        return self.model_copy(update={"space": own})
 
     def without_effect(self, prior: str) -> frozenset[str]:
         """Return the settings that change nothing with a prior, at the defaults and at each value that is checked."""

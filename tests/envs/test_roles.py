@@ -328,3 +328,14 @@ def test_roles_of_names_that_say_nothing_are_listed():
     Listed.action = {"one": WORDS}
     with pytest.raises(UserError, match="is given by role, but not of 'other'; add it"):
         make_it(Listed)
+
+
+@pytest.mark.parametrize("transforms", ["d4*agents", "agents", "d4,agents"])
+def test_orders_of_agents_are_left_out_of_a_role_of_one_that_is_weighed(transforms):
+    overrides = {"task.control": "both", "prior.kind": "auto", "prior.transforms": transforms, "mappo.num_envs": 4}
+    config = prepared(resolve_config("predator-prey", overrides=overrides, seeds=(0,), steps=200))
+    learner = build_learner(config)
+    assert bool(learner.iterate(0.0).finite.all())
+    names = {name: one.prior.transforms.names if one.prior.transforms else () for name, one in learner.each.items()}
+    assert any("agents" in name for name in names["predators"])
+    assert not any("agents" in name for name in names["prey"])

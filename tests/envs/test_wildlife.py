@@ -171,3 +171,13 @@ def test_anchors_of_the_card() -> None:
     for policy, expected in (("random", -2.8), ("surround", 1.98)):
         mean, error = episode_return(env, policy)
         assert mean == pytest.approx(expected, abs=4 * error + 0.03)
+
+
+@pytest.mark.parametrize("drones", [3, 18])
+def test_few_and_many_drones_see_where_each_other_is(drones) -> None:
+    env = make("wildlife", 2, [0], {"num_agents": drones, "width": 9, "height": 9})
+    seen = env.reset()
+    cells = seen.state.view(2, drones + 1, 2)[:, :drones]
+    others = seen.obs.view(2, drones, -1)[..., -2 * (drones - 1) :].view(2, drones, drones - 1, 2)
+    for i in range(drones):
+        assert torch.equal(others[:, i], torch.cat([cells[:, :i], cells[:, i + 1 :]], 1) - cells[:, i : i + 1])

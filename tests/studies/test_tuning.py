@@ -40,8 +40,10 @@ def points(*means: float) -> list[Point]:
 @pytest.mark.parametrize("algorithm", ["mappo", "maddpg", "qmix"])
 def test_every_algorithm_has_a_space_whose_corners_are_settings_that_it_takes(algorithm):
     assert algorithm in ALGORITHMS
-    for task in ("navigation", "predator-prey"):
-        tuning(task=task, algorithm=algorithm, overrides={}, space=default_space(algorithm)).check((0, 1))
+    for task in ("navigation", "predator-prey", "wildlife"):
+        asked = tuning(task=task, algorithm=algorithm, overrides={}, space=default_space(algorithm))
+        (searched := asked.around_defaults()).check((0, 1))
+        assert ("network.activation" in searched.space) == (task != "wildlife"), "what its network has"
     without = space_of(default_space(algorithm), "none")
     assert set(default_space(algorithm)) - set(without) == {"prior.consistency_coef"}
 

@@ -86,6 +86,8 @@ def test_what_a_preset_sets_for_its_network_is_left_out_for_another_that_does_no
         ("predator-prey", "maddpg", {"task.actions": "continuous"}, {"maddpg.actor_gradient"}),
         ("formation", "maddpg", {}, {"maddpg.actor_gradient"}),
         ("formation", "maddpg", {"task.num_obstacles": 0}, {"maddpg.actor_gradient", "task.obstacle_radius_m"}),
+        ("navigation", "maddpg", {}, {"maddpg.critic_activation", "task.local_ratio"}),
+        ("navigation", "qmix", {}, {"qmix.hyper_width", "task.local_ratio"}),
         ("predator-prey", "qmix", {"network.layer_norm": True}, {"network.precision", "network.compiled"}),
         (
             "predator-prey",
