@@ -233,3 +233,15 @@ def test_a_state_that_is_no_row_of_observations_is_told_by_its_number_of_fields(
     monkeypatch.setattr("esp_envs.spec.joint_layout", lambda *_: pytest.fail("lists a field of each agent"))
     assert env.spec.joint_fields is None
     assert not env.spec.is_joint
+
+
+def test_a_seed_that_failed_leaves_the_others_alone():
+    envs = [make("navigation", 1, [0, 1], {"num_agents": 200, "sees": 2, "actions": "continuous"}) for _ in range(2)]
+    for env in envs:
+        env.reset()
+    whole = envs[0].random_action()
+    broken = whole.clone()
+    broken[1] = torch.nan
+    first, second = (env.step(action).next.obs for env, action in zip(envs, (whole, broken), strict=True))
+    assert torch.equal(first[0], second[0])
+    assert not bool(second[1].isfinite().all())

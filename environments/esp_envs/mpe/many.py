@@ -82,7 +82,7 @@ class ManyWorlds(ParticleWorlds):
         assert self.seen_agents is not None
         assert self.seen_landmarks is not None
         agents, solid = self.bodies.num_agents, self._num_solid
-        entity = self.entity[:, :, world].contiguous()
+        entity = self.entity[:, :, world].nan_to_num()  # a seed that failed has NaN, which no tree takes
         crowd, landmark = entity[: self._crowd], entity[agents:]
         found = torch.from_numpy(KDTree(crowd.numpy()).query(crowd.numpy(), k=range(1, self._sees[0] + 2))[1])
         itself = found == torch.arange(len(crowd)).unsqueeze(1)  # once in a row, unless many are in one place
