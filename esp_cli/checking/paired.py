@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from functools import cache, cached_property
 
@@ -124,9 +123,10 @@ class _Judge:
         return replace(found, fields=fields, reason=_FURTHER.format(", ".join(field.field for field in fields)))
 
     def _as_later(self, element: Element | Shift, found: ElementVerdict) -> ElementVerdict:
-        broken = None
-        with suppress(Late):
+        try:
             broken = self._onwards.broken_later(element) if self._onwards is not None else None
+        except (Exception, SystemExit):  # the time is over, or the task raises in steps that follow
+            broken = None
         if broken is None and self._spec.hidden:
             return replace(found, fields=(), reason=_HIDDEN.format(" and ".join(self._spec.hidden)))
         return replace(found, fields=broken) if broken else found

@@ -139,8 +139,22 @@ class Alone(Delayed):  # of whose later steps nobody knows how they go on
         return world["position"][:, :, 0].norm(dim=-1) > 1
 
 
+class Raising(Point):  # that stands still on the right, and raises where the second step finds it on the left
+    def _start(self, generator):
+        return {name: value.abs() for name, value in super()._start(generator).items()}
+
+    def moved(self, world, action):
+        if self._time and float(world["position"][..., 0].min()) < 0:
+            raise ValueError("too far to the left")
+        return 0 * action
+
+
 def test_what_the_state_leaves_out_is_not_covered_where_no_later_step_tells():
     assert verdict(Alone, "flip-x") == ("not covered", set())
+
+
+def test_a_task_that_raises_in_steps_that_follow_images_is_judged_by_the_others():
+    assert verdict(Raising, "flip-y")[0] == "holds"
 
 
 @pytest.mark.parametrize(("task", "field"), [(Cost, "reward"), (NoEnd, "end")])
