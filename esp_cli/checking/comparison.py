@@ -54,6 +54,7 @@ def state_by_state(
     if share := float((torch.stack(others) == own).all(0).logical_and(image != own).float().mean()):
         return FieldVerdict(name, "broken", share, 0.0, share=share)  # numbers on one side alone
     before = first.get(f"start {name}", x)
+    before = before if len(before) == len(x) else x  # some simulators of others do not say what is seen at the start
     (x, x2, y), known = _known(x, x2, y)
     if not len(x):
         return FieldVerdict(name, "not covered", float("nan"), float("nan"))

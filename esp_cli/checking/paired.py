@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache, cached_property
 
@@ -123,10 +124,9 @@ class _Judge:
         return replace(found, fields=fields, reason=_FURTHER.format(", ".join(field.field for field in fields)))
 
     def _as_later(self, element: Element | Shift, found: ElementVerdict) -> ElementVerdict:
-        try:
+        broken = None
+        with suppress(Late):
             broken = self._onwards.broken_later(element) if self._onwards is not None else None
-        except (Exception, SystemExit):  # the time is over, or the task raises in steps that follow
-            broken = None
         if broken is None and self._spec.hidden:
             return replace(found, fields=(), reason=_HIDDEN.format(" and ".join(self._spec.hidden)))
         return replace(found, fields=broken) if broken else found
@@ -182,11 +182,16 @@ class _Pairs:
     def broken_later(self, element: Element | Shift) -> tuple[FieldVerdict, ...] | None:
         """Return fields that are broken in so many states that rounding, which grows, is no reason.
 
-        None where chance or rounding decides some field, and none is broken.
+        None where chance or rounding decides some field, and none is broken, or the task raises.
         """
         transform = self._transform(element)
         first, second, near = self._images(transform)
-        alike = self._there(transform, 0, _HERE[0])
+        try:
+            alike = self._there(transform, 0, _HERE[0])
+        except Late:
+            raise
+        except (Exception, SystemExit):
+            return None
         verdicts = [state_by_state(name, first, second, alike, near) for name in first]
         least = 0.5 / len(self._visited)
         broken = [v for v in verdicts if v is not None and v.outcome == "broken" and not v.share <= least]

@@ -28,6 +28,7 @@ _NUDGE = 1e-6  # how far a state is moved to see what rounding does
 def visit(env: Environment, watch: Watch, until: float, early: bool = False) -> list[tuple[Tensor, Tensor]]:
     """Return states and joint actions along episodes, half of the worlds random, half by the heuristic if any.
 
+    Where episodes were terminated, the last moment has the states and actions that this followed; other worlds repeat.
     After `until` no more steps are taken. With `early`, moments lie closer together at the beginning, so that a slow
     simulator reaches most of them in time: 0, 1, 5, 12, 31, 74, 177, 421 of 1000 steps.
     """
@@ -35,6 +36,7 @@ def visit(env: Environment, watch: Watch, until: float, early: bool = False) -> 
     places = (((last + 1) ** (k / MOMENTS) - 1) if early else k * last / MOMENTS for k in range(MOMENTS))
     taken = set(map(round, places))
     visited: list[tuple[Tensor, Tensor]] = []
+    ending: tuple[Tensor, Tensor] | None = None
     for t in range(max(taken) + 1):
         if visited and time.monotonic() > until:
             break
@@ -44,9 +46,21 @@ def visit(env: Environment, watch: Watch, until: float, early: bool = False) -> 
         steered, half = action.clone(), env.num_envs // 2
         if env.heuristics:
             steered[:, :half] = env.heuristic()[:, :half]
-        observation = env.step(steered).next
+        step = env.step(steered)
+        if env.spec.terminates and bool(step.terminated.any()):
+            before = (observation.state, steered)
+            ending = _where(step.terminated, before, ending or visited[0])
+        observation = step.next
         watch(t + 1, max(taken) + 1, "steps")
-    return visited
+    return visited if ending is None else [*visited, ending]
+
+
+def _where(flags: Tensor, first: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """Return states and actions of the first pair where flags [1, E] are on, of the other elsewhere."""
+    state, action = (
+        torch.where(flags.view(1, -1, *(1,) * (a.dim() - 2)), a, b) for a, b in zip(first, other, strict=True)
+    )
+    return state, action
 
 
 def outcomes(

@@ -174,7 +174,7 @@ def test_a_check_finds_what_is_declared_and_refutes_what_is_wrong(sound, wrong, 
     pytest.importorskip("gymnasium_robotics")
     reports = []
     for cls in (sound, wrong):
-        settings = cls.Settings(workers=0, horizon=12)
+        settings = cls.Settings(workers=0, horizon=60)  # in which some fall
         reports.append(check_symmetry(lambda n, seeds: cls(settings, n, generators_for(seeds)), element))  # noqa: B023
     assert [(report.broken, report.uncovered) for report in reports] == [((), ()), ((element,), ())]
     assert {field.field for field in reports[1].elements[0].fields if field.outcome == "broken"} == {"reward"}

@@ -170,3 +170,12 @@ def test_transitions_show_ends():
 
 def test_rewards_that_nearly_all_lie_in_the_rarest_hundredth_are_not_covered():
     assert verdict(Seldom, "rot90", from_transitions=True) == ("not covered", {"reward"})
+
+
+class Far(End):  # where few episodes end, each in a step of its own
+    def _ended(self, world):
+        return world["position"][:, :, 0, 0] > 1.15
+
+
+def test_states_from_which_episodes_ended_are_visited():
+    assert verdict(Far, "rot90") == ("broken", {"end"})
