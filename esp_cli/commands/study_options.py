@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from esp_cli.studies.catalogue import Request
 
 
-def _changed(annotation: Any, **changes: object) -> Any:
+def changed(annotation: Any, **changes: object) -> Any:
+    """Return an annotation whose option has other attributes, such as its help."""
     kind, option = get_args(annotation)
     option = copy.copy(option)
     vars(option).update(changes)
@@ -32,7 +33,7 @@ def _changed(annotation: Any, **changes: object) -> Any:
 if TYPE_CHECKING:
     StudySeedsOption = tuple[int, ...] | None
 else:
-    StudySeedsOption = _changed(options.SeedsOption, show_default=str(len(STUDY_SEEDS)))
+    StudySeedsOption = changed(options.SeedsOption, show_default=str(len(STUDY_SEEDS)))
 
 
 def parse_names(items: Sequence[str] | None, known: Collection[str] = ()) -> tuple[str, ...] | None:
@@ -156,7 +157,7 @@ def study_command(command: Callable[..., None] | None = None, **helps: str) -> C
     del own["choices"]
     shared = dict(inspect.signature(StudyChoices, eval_str=True).parameters)
     for name, text in helps.items():
-        shared[name] = shared[name].replace(annotation=_changed(shared[name].annotation, help=text))
+        shared[name] = shared[name].replace(annotation=changed(shared[name].annotation, help=text))
     context = inspect.Parameter("context", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context)
     parameters = sorted([context, *own.values(), *shared.values()], key=lambda one: one.default is not one.empty)
 

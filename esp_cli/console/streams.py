@@ -11,6 +11,7 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -65,9 +66,12 @@ err = SafeConsole(file=_StandardError(), highlight=False)  # type: ignore[arg-ty
 
 
 def fit_encoding() -> None:
-    """Let standard output and error write a question mark for a character that their encoding does not have."""
+    """Let standard output and error write a question mark for what their encoding lacks, or nowhere where closed."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115 - it stays open
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # nothing, where a descriptor is closed
+        if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
 
 

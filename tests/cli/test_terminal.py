@@ -4,6 +4,7 @@ import fcntl
 import os
 import pty
 import re
+import shlex
 import struct
 import subprocess
 import sys
@@ -233,3 +234,11 @@ def completed(line: str, **environment: str) -> list[str]:
 )
 def test_the_shell_is_offered_what_can_follow(line: str, offered: list[str]) -> None:
     assert completed(line) == offered
+
+
+@pytest.mark.parametrize("closed", ["2>&-", ">&- 2>&-"])
+def test_long_work_goes_on_where_nobody_can_read_what_is_said(tmp_path: Path, closed: str) -> None:
+    run = f'exec "{sys.executable}" -c "from esp_cli.app import main; main()"'
+    words = shlex.join(["train", "--steps", "400", *map(str, TINY_OPTIONS), "--out", "run"])
+    done = subprocess.run(["sh", "-c", f"{run} {words} {closed}"], cwd=tmp_path, check=False)
+    assert (done.returncode, (tmp_path / "run" / "policy.safetensors").is_file()) == (0, True)
