@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 
 import torch
 from torch import Tensor
@@ -23,10 +23,9 @@ from esp_cli.checking.comparison import (
     state_by_state,
 )
 from esp_cli.checking.shifting import Shift
-from esp_cli.checking.stepping import followed, nudged, outcomes, stretched, visit
-from esp_cli.checking.verdicts import ElementVerdict, FieldVerdict, Late, Watch, verdicts_of
+from esp_cli.checking.stepping import nudged, outcomes, stretched, visit
+from esp_cli.checking.verdicts import ElementVerdict, FieldVerdict, Late, Watch, may_come, verdicts_of
 from esp_cli.symmetry import Element, Transform, build_transform
-from esp_envs.base import Step
 from esp_envs.promises import MakeWorlds
 from esp_envs.spec import TaskSpec
 
@@ -94,7 +93,7 @@ class _Judge:
 
     @cached_property
     def _further(self) -> _Pairs | None:
-        return self._tried([(stretched(state, self._spec.state), action) for state, action in self._some], outcomes)
+        return self._tried([(stretched(state, self._spec.state), action) for state, action in self._some])
 
     @cached_property
     def _onwards(self) -> _Pairs | None:
@@ -103,12 +102,12 @@ class _Judge:
             return None
         actions = [action[:, ::_SOME] for _, action in self._moments]
         count, start = min(_LATER, spec.horizon), self._moments[0][0][:, ::_SOME]
-        return self._tried([(start, actions[k % len(actions)]) for k in range(count)], followed)
+        return self._tried([(start, actions[k % len(actions)]) for k in range(count)], onwards=True)
 
-    def _tried(self, visited: Sequence[Visited], play: Callable[..., list[Step]]) -> _Pairs | None:
+    def _tried(self, visited: Sequence[Visited], onwards: bool = False) -> _Pairs | None:
         """Return pairs from states, or None where these, or what is done in them, are not for this task."""
         try:
-            return _Pairs(self._make, visited, self._until, play)
+            return _Pairs(self._make, visited, self._until, onwards)
         except Late:
             raise
         except (Exception, SystemExit):
@@ -135,24 +134,19 @@ class _Judge:
 class _Pairs:
     """Steps from visited states [1, E, state width], compared with steps from their images; after `until`, `Late`.
 
-    `play` makes the steps: `outcomes` that of each state, `followed` those of the episodes that go on from the first.
+    With `onwards` the steps are those of episodes that go on from the first states; see `outcomes`.
     """
 
-    def __init__(
-        self,
-        make: MakeWorlds,
-        visited: Sequence[Visited],
-        until: float,
-        play: Callable[..., list[Step]] = outcomes,
-    ) -> None:
-        self._visited, self._until, self._play, worlds = visited, until, play, visited[0][0].shape[1]
+    def __init__(self, make: MakeWorlds, visited: Sequence[Visited], until: float, onwards: bool = False) -> None:
+        self._visited, worlds = visited, visited[0][0].shape[1]
+        self._play = partial(outcomes, until=until, onwards=onwards)
         self._twins = [make(worlds, [seed]) for seed in _HERE]
         for env in self._twins:
             env.renews = False
         self._spec = self._twins[0].spec
-        self._here = [play(env, visited, None, seed, until) for env, seed in zip(self._twins, _HERE, strict=True)]
+        self._here = [self._play(env, visited, None, seed) for env, seed in zip(self._twins, _HERE, strict=True)]
         near = [(nudged(state), action) for state, action in visited]
-        self._here.append(play(self._twins[0], near, None, _HERE[0], until))
+        self._here.append(self._play(self._twins[0], near, None, _HERE[0]))
 
     def judge(self, element: Element | Shift) -> ElementVerdict:
         """Compare the steps from the images with the images of the steps."""
@@ -206,7 +200,7 @@ class _Pairs:
 
     def _there(self, transform: Transform | Shift, twin: int, seed: int) -> Outcomes:
         """Return outcomes of the images."""
-        return by_field(self._play(self._twins[twin], self._visited, transform, seed, self._until), self._spec, None)
+        return by_field(self._play(self._twins[twin], self._visited, transform, seed), self._spec, None)
 
     def _unseen(self, name: str, first: Outcomes, alike: Outcomes) -> FieldVerdict | None:
         """Say that ends, or rewards, which never came or never changed could not have shown a breaking."""
@@ -214,5 +208,5 @@ class _Pairs:
         if name not in ("reward", "end") or bool((rows != rows[:1]).any()):
             return None
         ends = bool(first["end"].any()) and not bool(first["end"].all())
-        unseen = self._spec.terminates if name == "end" else not ends or not bool(rows.any())
+        unseen = may_come(name, ends, bool(rows.any())) and (name != "end" or self._spec.terminates)
         return FieldVerdict(name, "not covered", 0.0, 0.0) if unseen else None

@@ -69,40 +69,21 @@ def outcomes(
     turned: Transform | Shift | None,
     seed: int,
     until: float,
+    onwards: bool = False,
 ) -> list[Step]:
     """Return the steps from each moment's states; the start's observation replaces `next` of the episode's end.
 
     `turned` makes the images, None the states themselves. Agents of other roles act at random with the run's `seed`,
-    alike in each run, in images turned.
+    alike in each run, in images turned. With `onwards` episodes go on from the first moment's states, with the actions
+    of all moments: clocks run, and what no state holds builds up.
     """
     _begin(env, len(visited), turned, seed)
-    steps = []
+    steps, seen = list[Step](), None
     for state, action in visited:
         stop_at(until)
-        env.reset()
-        start = env.set_state(state if turned is None else turned.state(state))
-        step = env.step(action if turned is None else turned.action(action))
-        steps.append(replace(step, next=start, final=step.reached, metrics={}))
-    return steps
-
-
-def followed(
-    env: Environment,
-    visited: Sequence[tuple[Tensor, Tensor]],
-    turned: Transform | Shift | None,
-    seed: int,
-    until: float,
-) -> list[Step]:
-    """Return the steps of the episodes that begin in the first moment's states, one for each moment's actions.
-
-    Clocks run on, and what no state holds builds up; arguments and results as of `outcomes`.
-    """
-    _begin(env, len(visited), turned, seed)
-    env.reset()
-    state, steps = visited[0][0], list[Step]()
-    seen = env.set_state(state if turned is None else turned.state(state))
-    for _, action in visited:
-        stop_at(until)
+        if seen is None or not onwards:
+            env.reset()
+            seen = env.set_state(state if turned is None else turned.state(state))
         step = env.step(action if turned is None else turned.action(action))
         steps.append(replace(step, next=seen, final=step.reached, metrics={}))
         seen = step.next

@@ -27,7 +27,7 @@ from esp_cli.checking.candidates import is_declared
 from esp_cli.checking.controls import STILL, Controls, Sides, strength, trust_in
 from esp_cli.checking.predictor import Predictor, done
 from esp_cli.checking.recorded import Transitions, outputs_of, turned
-from esp_cli.checking.verdicts import SIGNIFICANT, ElementVerdict, FieldVerdict, Watch, concluded, verdicts_of
+from esp_cli.checking.verdicts import SIGNIFICANT, ElementVerdict, FieldVerdict, Watch, concluded, may_come, verdicts_of
 from esp_cli.symmetry import Element, Transform, build_transform
 from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, Spaces
@@ -90,12 +90,14 @@ def _judge(element: Element, spaces: Spaces, halves: Sequence[_Half], first: Tra
         reason = f"{1 - share:.0%} of the images lie outside what was seen"
         return ElementVerdict(element.name, declared, (), reason)
     counts = compared[0].counts & compared[1].counts
+    ends = any(half.held.terminated is not None and bool(half.held.terminated.any()) for half in halves)
+    pays = any(bool(half.held.reward.any()) for half in halves)
     verdicts = []
     for name in halves[0].fields:
         alone, squares, planted = (torch.cat([one.fields[name][k] for one in compared]) for k in range(3))
         still = all(float(half.spread[half.fields[name]].sum()) < STILL**2 for half in halves)
         # that it never changes is its law where it is seen; that of rewards and ends which never came is unknown
-        of_nothing = concluded(name, 0.0, 0.0, broken=False, p_value=float(_never_came(name, halves)))
+        of_nothing = concluded(name, 0.0, 0.0, broken=False, p_value=float(may_come(name, ends, pays)))
         verdicts.append(of_nothing if still else _judged(name, alone, squares, planted[:, counts]))
     found = ElementVerdict(element.name, declared, tuple(verdicts))
     image = turned(first, transform)
@@ -106,12 +108,6 @@ def _judge(element: Element, spaces: Spaces, halves: Sequence[_Half], first: Tra
         reason = f"the first actions differ from their image by {preference:.2f} s.d."
         return ElementVerdict(element.name, declared, (), reason)
     return found
-
-
-def _never_came(name: str, halves: Sequence[_Half]) -> bool:
-    """Return whether what never changed may do so elsewhere: an end, or a reward unless episodes were seen to end."""
-    ends = any(half.held.terminated is not None and bool(half.held.terminated.any()) for half in halves)
-    return name == "end" or (name == "reward" and not (ends and any(bool(half.held.reward.any()) for half in halves)))
 
 
 def _judged(name: str, alone: Tensor, squares: Tensor, planted: Tensor) -> FieldVerdict:

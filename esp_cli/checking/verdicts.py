@@ -82,6 +82,11 @@ def concluded(
     return FieldVerdict(field, outcome, gap, error, 1.0 if broken else p_value, share)
 
 
+def may_come(field: str, ends: bool, pays: bool) -> bool:
+    """Return whether a field that never changed may do so elsewhere: an end; a reward, unless it pays and play ends."""
+    return field == "end" or (field == "reward" and not (ends and pays))
+
+
 def chance(gap: float, tolerance: float, error: float) -> float:
     """Return how likely a normal gap is to be this small, if its expectation is the tolerance."""
     return NormalDist().cdf((gap - tolerance) / max(error, 1e-12))
