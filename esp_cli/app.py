@@ -26,6 +26,7 @@ from esp_cli.files import formatting
 from esp_cli.files.formatting import did_you_mean
 from esp_envs.errors import UserError
 
+_LACK_OF_MEMORY = re.compile("can't allocate memory|out of memory")  # as torch says it
 _HELP_NAMES = {"help_option_names": ["-h", "--help"]}
 _OTHER_NAMES = {
     "--seed": "--seeds 3 takes the seeds 0 to 2, --seed-list 7 that seed",
@@ -123,6 +124,9 @@ def report(failure: Exception | SystemExit) -> int | None:
     if isinstance(failure, OSError) and failure.errno is not None:
         console.error(formatting.sentence(failure))
         return EXIT_USER if formatting.is_correctable(failure) else EXIT_MACHINE
+    if isinstance(failure, MemoryError) or _LACK_OF_MEMORY.search(str(failure)):
+        console.error("this needs more memory than there is; choose fewer agents, worlds, episodes or seeds")
+        return EXIT_MACHINE
     installed = sys.modules.get("esp_envs.installed")  # not imported: then no code of the user ran
     place = None if installed is None else installed.raised_in(failure)
     if installed is None or place is None:

@@ -14,6 +14,7 @@ import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -186,6 +187,8 @@ def plan(
     """Return the configuration of a new run and its first weights, as `train`; refuse what does not go together."""
     if isinstance(seeds, int):
         raise UserError(f"seeds are the numbers of the seeds, not how many; write seeds=range({seeds})")
+    if not isinstance(steps, Integral):
+        raise UserError(f"steps are a whole number, not {steps!r}; write for example steps=100_000")
     config = prepared(resolve_config(task, algo, preset, steps, seeds, resolve_device(device), settings))
     learner = build_learner(config)
     if init_from is None:

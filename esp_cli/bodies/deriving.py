@@ -25,6 +25,7 @@ from esp_envs.errors import UserError
 LOOSE = 0.1  # how far a matched joint's line may be off, as a share of the robot's size, or of its axis' length
 FAR = 0.25  # how far a body's middle of mass may be off, as a share of the robot's size, to be matched
 _APART = 1e6
+_UNLIKE = 0.02
 
 
 @dataclass(frozen=True)
@@ -169,9 +170,11 @@ def _control_map(frame: Frame, qvel: Floats) -> tuple[Floats, tuple[str, ...]]:
     image, ctrl = unit @ qvel.T, np.zeros((model.nu, model.nu))
     dynamics = model.actuator_dyntype, model.actuator_dynprm * (model.actuator_dyntype != 0)[:, None]
     types = np.column_stack([model.actuator_gaintype, model.actuator_biastype, *dynamics, model.actuator_delay])
+    servos = model.actuator_biasprm != 0  # of position or of velocity, in any order on each side
     gaps = np.abs(image[:, None] - np.stack([unit, -unit])[:, None]).max(-1, initial=0)
     gap = gaps.min(0) + _APART * (types[:, None] != types).any(-1)
     gap += 0.1 * np.abs(np.subtract.outer(scale, scale)) / max(scale.max(initial=0), 1e-12)
+    gap += _UNLIKE * (servos[:, None] != servos).any(-1)
     mirrored = [a for a in range(model.nu) if scale[a] > 0]
     unmatched = {a for a in range(model.nu) if scale[a] == 0}
     for a, b in zip(*linear_sum_assignment(gap[np.ix_(mirrored, mirrored)]), strict=True):

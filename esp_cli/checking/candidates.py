@@ -131,10 +131,10 @@ def named(accepted: Sequence[Element], tried: Sequence[Element], scene: str = ""
 
     A group of the scene, as of legs, is looked at too. It counts where all of its elements that were tried are
     accepted, and generate it; coupled generators, as flip-x*agents-1-0, count one by one. All orders of agents, or of a
-    field's items, count where the accepted orders generate them.
+    field's items, count where those that were tried are accepted and generate them.
     """
     plane, text = _scene([e for e in accepted if not e.orders], [e for e in tried if not e.orders], scene)
-    whole, single = _orders_of(accepted)
+    whole, single = _orders_of(accepted, tried)
     glue = " and " if "," in plane else "*"
     name = " and ".join([glue.join((plane, *whole)), *([",".join(single)] if single else [])])
     glue = "," if "," in plane else "*"
@@ -183,19 +183,19 @@ def _polygon_groups(tried: Sequence[Element]) -> list[tuple[str, tuple[Element, 
     return found
 
 
-def _orders_of(accepted: Sequence[Element]) -> tuple[list[str], list[str]]:
+def _orders_of(accepted: Sequence[Element], tried: Sequence[Element]) -> tuple[list[str], list[str]]:
     """Return the groups of all orders of agents or items, and the accepted elements with orders that make up none."""
     found, whole = dict[tuple[str, int], list[Element]](), list[str]()
     single = [element.name for element in accepted if element.orders and not element.in_place.is_identity]
-    for element in accepted:
+    for element in tried:
         if len(element.orders) == 1 and element.in_place.is_identity:
             name, places = element.orders[0]
             found.setdefault((name, len(places)), []).append(element)
     for (name, count), elements in sorted(found.items(), key=lambda one: (one[0][0] != "agents", one[0])):
-        if _mix(elements, count):
+        if set(elements) <= set(accepted) and _mix(elements, count):
             whole.append(name if name == "agents" else f"{name}-{count}")
         else:
-            single += [element.name for element in elements]
+            single += [element.name for element in elements if element in accepted]
     return whole, single
 
 

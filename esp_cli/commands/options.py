@@ -139,10 +139,12 @@ def not_over_a_run(context: typer.Context, path: T) -> T:
     if path is None or str(path) == "-":
         return path
     from esp_cli.files.documents import begins_with  # pydantic comes with it, which no help needs
+    from esp_cli.files.writing import refuse_unwritable
 
     real = Path(os.path.realpath(str(path)))  # a link is followed when it is written
     if real.is_dir():  # known before hours of work
         raise UserError(f"{path} is a folder; name a file in it")
+    refuse_unwritable(real)
     documents = (of.CONFIG, of.STUDY, of.TUNING)
     names = (*documents, of.METRICS, of.POLICY, of.INITIAL, of.LOCK, of.JOURNAL, of.STUDY_LOCK)
     owned = real.is_file() and real.name in (names if context.info_name == "eval" else (*names, of.FINAL))

@@ -95,12 +95,12 @@ def report(
         picture = draw_curves(material, plot, style)
         for file in (picture.png, picture.svg, *([picture.svg.with_suffix(".pdf")] if style == "paper" else [])):
             console.note(f"curves -> {file}")
-    console.result(json, material.results.document(statistics=True), lambda: print_answer(material, full))
+    console.result(json, material.results.document(statistics=True), lambda: print_answer(material, full, limits))
     if not full and json != "-":
         console.note("every table: add --full")
 
 
-def print_answer(material: Material, full: bool) -> None:
+def print_answer(material: Material, full: bool, thresholds: Sequence[float] = ()) -> None:
     """Print what came out, on request below every table."""
     from esp_cli.reporting.page import answer
     from esp_cli.reporting.tables import all_tables
@@ -108,7 +108,7 @@ def print_answer(material: Material, full: bool) -> None:
     with console.paged():
         for table in all_tables(material.results) if full else ():
             console.table(table.headings, table.rows, title=table.title, caption=table.caption)
-    for text in answer(material):
+    for text in answer(material, thresholds):
         console.text(text)
 
 

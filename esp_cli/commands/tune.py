@@ -127,7 +127,7 @@ def _tune(tuning: Tuning, request: Request, choices: StudyChoices) -> None:
         stop_requests("stopping every run after its iteration") as requests,
     ):
         if StudyFolder.is_one(judged):  # of a search that goes on: other seeds are refused before it does
-            StudyFolder.create(judged, fresh_study(tuning, {}, request.seeds, request.episodes))
+            StudyFolder.planned(judged, fresh_study(tuning, {}, request.seeds, request.episodes))
         search = Search.create(out, tuning)
         search.check = resources.check
         failed = studying.follow(Scheduler(search, search.cells, resources.jobs, resources.engine), requests)
@@ -136,7 +136,7 @@ def _tune(tuning: Tuning, request: Request, choices: StudyChoices) -> None:
         _report(search, outcomes, quiet=choices.json == "-")
         if best and not (requests or failed):
             study = fresh_study(tuning, best, request.seeds, request.episodes)
-            fresh = StudyFolder.create(judged, study)
+            fresh = StudyFolder.create(judged, study, keep=False)  # a longer search may have found another winner
             failed = studying.run_cells(fresh, study, resources, requests)
     studying.conclude(fresh, failed, requests, out, choices)
     if not best:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import errno
 import math
-import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -18,7 +16,7 @@ from esp_cli.defaults import SLOWEST
 from esp_cli.drawing.figures import INCHES, PAPER, PAPER_DPI, STEADY, saved, summary
 from esp_cli.drawing.films import GIF_FRAMES_PER_SECOND, Frame, frame, write_gif, write_mp4, write_png
 from esp_cli.drawing.recording import HOLD_SECONDS, Episode, framed, record
-from esp_cli.files.writing import write_file
+from esp_cli.files.writing import refuse_unwritable, write_file
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training.build import build_environment
 from esp_envs.base import Environment
@@ -65,8 +63,7 @@ class Request:
             raise UserError(f"speed is {self.speed}; give times real time, {SLOWEST:g} or more")
         if self.view not in get_args(View):
             raise UserError(f"there is no view '{self.view}'; choose {', '.join(get_args(View))}")
-        if self.out.is_dir():
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(self.out))
+        refuse_unwritable(self.out)
 
     @property
     def kind(self) -> str:

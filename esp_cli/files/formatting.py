@@ -125,7 +125,7 @@ _CORRECTABLE = {
     *(errno.ELOOP, errno.ENAMETOOLONG, errno.EINVAL, errno.ENXIO, errno.EXDEV),
 }
 _ADVICE = {
-    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "free some space and run the command again"),
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), "free some space and run the command again, or resume it"),
     errno.EFBIG: "raise the limit on the size of a file (ulimit -f) and run the command again",
     errno.EROFS: "make the file system writable, or choose another path",
 }

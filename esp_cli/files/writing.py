@@ -8,6 +8,7 @@ program chose inside a folder is its own: whatever link stands there is replaced
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import os
 import secrets
@@ -39,6 +40,18 @@ def write_file(path: str | os.PathLike[str], content: bytes) -> None:
         return
     with path.open("wb", buffering=0) as file:
         write_all(file.fileno(), content)
+
+
+def refuse_unwritable(path: str | os.PathLike[str]) -> None:
+    """Refuse a path that `write_file` could not write, as known before the work whose result is to stand there."""
+    path = Path(os.path.realpath(path))
+    special = path.exists() and not path.is_file()
+    place = path if special else next(folder for folder in path.parents if folder.exists())
+    wrong = errno.EACCES if not os.access(place, os.W_OK) else 0 if special or place.is_dir() else errno.ENOTDIR
+    if path.is_dir():
+        wrong = errno.EISDIR
+    if wrong:
+        raise OSError(wrong, os.strerror(wrong), os.fspath(path))
 
 
 def replace_file(path: str | os.PathLike[str], content: bytes) -> None:

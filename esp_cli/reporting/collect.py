@@ -30,6 +30,7 @@ from esp_cli.training.settings import parse_config
 from esp_envs.errors import UserError
 from esp_envs.spec import TaskSpec
 
+_LIKE = 0.1  # of the steps trained, by which evaluations that are compared may lie apart
 _DIGITS = 4  # decimals that are kept of a return; the bootstrap and the tables need two
 
 
@@ -121,7 +122,7 @@ def collect_runs(
     _refuse_unlike(curves)
     first, *_ = curves
     cells, states, by_name = [], {}, {}
-    for step in tuple(dict.fromkeys(at)) or (min(curve.last_step for curve in curves),):
+    for step in _compared_at(curves, at):
         for k, curve in enumerate(curves):
             name, reference = f"{k}-{curve.label}-{step}", f"0-{first.label}-{step}" if k else None
             panel = f"{curve.config.task}, {format_exactly(step)}"
@@ -137,6 +138,44 @@ def collect_runs(
     )
     runs = {name: curve.path for name, curve in by_name.items()}
     return Material(study, _results(study, states, mode, thresholds), by_name, runs)
+
+
+def _compared_at(curves: Sequence[RunCurve], at: Sequence[int]) -> tuple[int, ...]:
+    """Return the steps at which runs are compared, by default the last at which all of them were evaluated."""
+    for step in at:
+        if not any(curve.until(step) for curve in curves):
+            raise UserError(
+                f"none of these runs got to step {format_exactly(step)}: {_evaluated(curves)}; give an earlier --at"
+            )
+        if not _alike(curves, step):
+            raise UserError(
+                f"these runs were not evaluated at like steps near {format_exactly(step)}: {_evaluated(curves)}; "
+                "give an --at near which all were evaluated"
+            )
+    if at:
+        return tuple(dict.fromkeys(at))
+    last = min(curve.last_step for curve in curves)
+    steps = sorted({int(step) for curve in curves for step in curve.steps if 0 < step <= last}, reverse=True) or [last]
+    found = next((step for step in steps if _alike(curves, step)), None)
+    if found is None:
+        raise UserError(
+            f"these runs were evaluated at no like steps: {_evaluated(curves)}; train them with the same "
+            "evaluation.every_steps"
+        )
+    return (found,)
+
+
+def _alike(curves: Sequence[RunCurve], step: int) -> bool:
+    """Whether the evaluations nearest to a step, of the runs that got there, are about equally far on."""
+    ends = [reached.last_step for curve in curves if (reached := curve.until(step)) is not None]
+    return max(ends) - min(ends) <= _LIKE * max(ends)
+
+
+def _evaluated(curves: Sequence[RunCurve]) -> str:
+    """State at which steps runs were evaluated."""
+    steps = {c.label: [format_exactly(int(step)) for step in c.steps] for c in curves}
+    few = {label: own if len(own) <= 4 else [*own[:2], "...", own[-1]] for label, own in steps.items()}
+    return "; ".join(f"{label} at {', '.join(own)}" for label, own in few.items())
 
 
 def _refuse_unlike(curves: Sequence[RunCurve]) -> None:

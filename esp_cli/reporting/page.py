@@ -9,7 +9,7 @@ import math
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -155,8 +155,12 @@ _VERDICTS: dict[Side, str] = {
 _SCALE = "where 0 is the random policy and 1 the best hand-written one"
 
 
-def answer(material: Material) -> list[str]:
-    """Return the answer: of one run beside its reference in full, of several how many are ahead."""
+def answer(material: Material, thresholds: Sequence[float] = ()) -> list[str]:
+    """Return the answer: of one run beside its reference in full, of several how many are ahead; then thresholds."""
+    return _outcome(material) + [_reached(material.results, limit) for limit in dict.fromkeys(thresholds)]
+
+
+def _outcome(material: Material) -> list[str]:
     results = material.results
     finished = [cell for cell in results.cells if cell.summary is not None and cell.summary.returns.mean is not None]
     pairs = [(cell, other) for cell in finished if (other := results.reference_of(cell)) is not None]
@@ -188,13 +192,18 @@ def _returns(results: Results, *cells: CellResult) -> str:
     ours = [f"{cell.variant} has {mean}" for cell, mean in zip(cells, means, strict=True)]
     scores = [f"{one.normalised.mean:.2f}" for one in summaries if one.normalised is not None]
     normalised = f"; normalised {' and '.join(scores)}, {_SCALE}" if scores else ""
-    seeds = len(cells[0].seeds)
-    what = f"{results.mode} return, {seeds} seed{'s'[: seeds - 1]}{normalised}"
+    counts = [sum(x is not None for x in cell.returns[results.mode]) for cell in cells]
+    seeds = f"{' and '.join(map(str, dict.fromkeys(counts)))} seed{'s' if max(counts) > 1 else ''}"
+    what = f"{results.mode} return, {seeds}{normalised}"
     return f"{cells[0].panel}: {' and '.join(ours)} ({what})."
 
 
 def _verdict(cell: CellResult, other: CellResult) -> str:
     gap = None if cell.summary is None else cell.summary.gap
+    stopped = [one.variant for one in (cell, other) if any(None in values for values in one.returns.values())]
+    if gap is None and stopped:
+        seeds = f"a seed of {' and of '.join(stopped)} stopped"
+        return f"There is no interval of the difference: {seeds}, and the others are no fair sample."
     if gap is None or gap.ahead is None:
         return "There is no interval of the difference, so this tells nothing for sure; take three seeds or more."
     interval = f"the difference is {gap.difference.value:+.2f}, 95 % interval {format_interval(gap.difference.ci95)}"
@@ -213,6 +222,17 @@ def _steps(material: Material, cell: CellResult, other: CellResult) -> list[str]
     return [
         f"The mean over seeds first has {limit:.2f} after {ours} steps of {cell.variant}, {theirs} of {other.variant}."
     ]
+
+
+def _reached(results: Results, threshold: float) -> str:
+    """State when the mean curve of each run first has a return."""
+    firsts = {}
+    several = results.kind != "runs" and len({cell.panel for cell in results.cells}) > 1
+    for cell in results.cells:
+        of_mean = next((p.of_mean for p in cell.steps_to if math.isclose(p.threshold, threshold, abs_tol=1e-4)), None)
+        name = f"{cell.variant} ({cell.panel})" if several else cell.variant
+        firsts[name] = "never" if of_mean is None else f"after {format_count(of_mean)} steps"
+    return f"The mean over seeds first has {threshold:g}: {', '.join(map(' '.join, firsts.items()))}."
 
 
 def _count(pairs: list[tuple[CellResult, CellResult]]) -> list[str]:

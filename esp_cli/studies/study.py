@@ -78,16 +78,19 @@ class StudyFolder(RunSet):
         self.study = study
 
     @classmethod
-    def create(cls, path: Path, study: Study) -> StudyFolder:
-        """Make a study folder, or go on with the one that is there; cells that it does not have yet are added."""
-        folder, differs = cls.planned(path, study)
+    def create(cls, path: Path, study: Study, keep: bool = True) -> StudyFolder:
+        """Make a study folder, or go on with the one that is there; cells that it does not have yet are added.
+
+        Cells that are there and not in the study stay, unless `keep` is False; their runs stay on the disk.
+        """
+        folder, differs = cls.planned(path, study, keep)
         path.mkdir(parents=True, exist_ok=True)
         if differs:
             STUDY_FORMAT.write(path / STUDY, folder.study.model_dump(mode="json"))
         return folder
 
     @classmethod
-    def planned(cls, path: Path, study: Study) -> tuple[StudyFolder, bool]:
+    def planned(cls, path: Path, study: Study, keep: bool = True) -> tuple[StudyFolder, bool]:
         """Return what `create` makes of a study, and whether that differs from what is there; writes nothing."""
         # As JSON shows it, so that it equals what is read again: a tuple in a task's settings becomes a list.
         study = Study.model_validate_json(study.model_dump_json())
@@ -108,8 +111,8 @@ class StudyFolder(RunSet):
         for cell, _ in again:
             cls(path, there)._refuse_old_rules(cell)
         wanted = {cell.name for cell in study.cells}
-        rest = tuple(cell for cell in there.cells if cell.name not in wanted)
-        if not wanted - set(known) and all(new == old for new, old in again):
+        rest = tuple(cell for cell in there.cells if keep and cell.name not in wanted)
+        if wanted.union(cell.name for cell in rest) == known.keys() and all(new == old for new, old in again):
             return cls(path, there), False
         commands = [*there.command.splitlines(), study.command] if rest else [study.command]
         merged: dict[str, object] = {"cells": study.cells + rest, "command": "\n".join(dict.fromkeys(commands))}

@@ -154,7 +154,7 @@ class Trials(StudyFolder):
         return self.is_trained(cell)
 
     @classmethod
-    def create(cls, path: Path, study: Study) -> Trials:
+    def create(cls, path: Path, study: Study, keep: bool = True) -> Trials:
         """Make the folder, or go on with it; what is judged already gets no further trials."""
         if StudyFolder.is_one(path / FRESH) and cls.is_one(path):
             known = {cell.name for cell in cls.open(path).study.cells}
@@ -164,7 +164,7 @@ class Trials(StudyFolder):
                     raise StudyError(
                         f"{path / FRESH} has judged {judged} already; keep its --budget, or choose another --out"
                     )
-        return cls(path, super().create(path, study).study)
+        return cls(path, super().create(path, study, keep).study)
 
 
 class Benchmark:

@@ -6,7 +6,7 @@ import json
 import math
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, Field, ValidationInfo, field_validator
 from pydantic_core import to_jsonable_python
@@ -50,7 +50,9 @@ class RunConfig(Strict):
     algorithm: str = Field(max_length=100)
     preset: str = Field("default", max_length=100)
     steps: int = Field(ge=1, le=MAX_STEPS, description="environment steps per seed")
-    seeds: tuple[int, ...] = Field((0,), min_length=1, max_length=MAX_SEEDS, description="as many as --seeds takes")
+    seeds: tuple[Annotated[int, Field(ge=0)], ...] = Field(
+        (0,), min_length=1, max_length=MAX_SEEDS, description="as many as --seeds takes"
+    )
     task_settings: dict[str, Any] = Field(default_factory=dict)
     algorithm_settings: dict[str, Any] = Field(default_factory=dict)
     network: AnyNetworkConfig = MlpConfig()
@@ -109,6 +111,8 @@ class RunConfig(Strict):
             self.task, self.algorithm, self.preset, self.steps, self.seeds, self.device, declared | named
         )
         known, own = plain.model_dump(mode="json"), self.model_dump(mode="json")
+        by_itself = self.network.model_copy(update={"compiled": "auto"}).decided(self.steps, self.device)
+        known["network"]["compiled"] = getattr(by_itself, "compiled", None)  # what auto decides beside these settings
         words = ["esp", "train", "--task", self.task, "--algo", self.algorithm]
         words += ["--preset", self.preset] if self.preset != "default" else []
         words += [*seed_words(self.seeds), "--steps", str(self.steps)]

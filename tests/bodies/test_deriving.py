@@ -307,3 +307,26 @@ def test_sensors_without_a_known_mirror_are_reported() -> None:
     told = '<user name="own" dim="1" needstage="acc" objtype="body" objname="chest"/><framequat objtype="body" '
     proof = with_sensors(told + 'objname="chest"/><touch site="imu"/>', extra='<site name="imu"/>')
     assert (proof.verdict, proof.sensors, proof.unjudged) == ("exact", {}, ("framequat", "touch", "user"))
+
+
+def test_servos_that_stand_in_another_order_on_each_side_have_their_images():
+    servo = '<{kind} name="{side}-{kind}" joint="{side}" k{letter}="9"/>'
+    arm = (
+        '<body pos="0 {y} 0"><joint name="{side}" axis="0 1 0"/>'
+        '<geom type="capsule" size="0.03" fromto="0 0 0 0.3 0 -0.1"/></body>'
+    )
+    servos = [
+        ("left", "position", "p"),
+        ("left", "velocity", "v"),
+        ("right", "velocity", "v"),
+        ("right", "position", "p"),
+    ]
+    body = body_of(
+        '<mujoco><worldbody><body pos="0 0 1"><freejoint/><geom type="box" size="0.2 0.1 0.05"/>'
+        + "".join(arm.format(side=side, y=y) for side, y in (("left", 0.15), ("right", -0.15)))
+        + "</body></worldbody><actuator>"
+        + "".join(servo.format(side=side, kind=kind, letter=letter) for side, kind, letter in servos)
+        + "</actuator></mujoco>"
+    )
+    assert body.group == "flip-x"
+    assert body.found["flip-x"].match.ctrl.tolist() == [[0, 0, 0, 1], [0, 0, 1, 0], [0, 1, 0, 0], [1, 0, 0, 0]]

@@ -135,6 +135,7 @@ def test_few_steps_of_a_law_without_chance_cover_it_where_some_are_far_out() -> 
 def test_one_exchange_is_not_all_orders() -> None:
     swap, around, last = parse_elements("agents-1-0-2,agents-1-2-0,agents-0-2-1", 3)
     assert named([swap], [swap, last])[0] == "c1 and agents-1-0-2"
+    assert named([swap, around], [swap, around, last])[0] == "c1 and agents-1-0-2,agents-1-2-0", "one did not hold"
     assert [named(found, found)[0] for found in ([swap, last], [swap, around])] == ["c1*agents", "c1*agents"]
 
 

@@ -77,10 +77,12 @@ def test_what_is_there_is_kept_unless_forced(finished: Path, tmp_path: Path) -> 
     before = (tmp_path / "policy.py").read_bytes()
     assert "has README.md already" in refused(*arguments)
     shutil.copy(tmp_path / "policy.py", tmp_path / "mine.py")
+    (tmp_path / "policy.onnx").write_text("of another policy")
     (tmp_path / "policy.py").write_text("")
     esp(*arguments, "--force")
     assert (tmp_path / "policy.py").read_bytes() == before
     assert (tmp_path / "mine.py").exists()
+    assert not (tmp_path / "policy.onnx").exists()
 
 
 def test_episodes_that_choose_nothing_are_refused(finished: Path, tmp_path: Path) -> None:

@@ -143,6 +143,8 @@ def test_what_cannot_be_played_or_drawn_is_refused(run: Run, tmp_path: Path, ask
     [
         ({"settings": {"mappo.lr": 1}}, "unknown setting 'mappo.lr'"),
         ({"seeds": 3}, r"not how many; write seeds=range\(3\)"),
+        ({"steps": "1k"}, "steps are a whole number, not '1k'"),
+        ({"seeds": (-1,)}, "bad value -1 for 'run.seeds.0': input should be greater than or equal to 0"),
         ({"device": "cuda:1"}, "there is no device 'cuda:1'; choose cpu, cuda or auto"),
     ],
 )

@@ -41,8 +41,19 @@ def test_a_learner_that_stays_below_is_compared_at_what_both_have(tmp_path: Path
 
 
 def test_a_stopped_seed_leaves_no_verdict(tmp_path: Path) -> None:
-    _, second, *_ = answered(tmp_path / "s", [[-200.0] * 3, [-160.0] * 3], [[-150.0] * 3, [-120.0, None, -119.0]])
-    assert second == "There is no interval of the difference, so this tells nothing for sure; take three seeds or more."
+    first, second, *_ = answered(tmp_path / "s", [[-200.0] * 3, [-160.0] * 3], [[-150.0] * 3, [-120.0, None, -119.0]])
+    assert "(greedy return, 2 and 3 seeds; normalised" in first
+    assert second == (
+        "There is no interval of the difference: a seed of MAPPO-ESP stopped, and the others are no fair sample."
+    )
+
+
+def test_the_steps_at_a_threshold_that_was_asked_for_are_told(tmp_path: Path) -> None:
+    folder = StudyFolder.create(tmp_path / "s", small_study())
+    for cell, end in zip(folder.study.cells, (-160.0, -120.0), strict=True):
+        write_run(folder, cell, [[-200.0] * 3, [end] * 3], [end] * 3)
+    *_, told = answer(collect_study(folder, thresholds=[-125.0]), [-125.0])
+    assert told == "The mean over seeds first has -125: MAPPO never, MAPPO-ESP after 100 steps."
 
 
 def test_of_several_runs_the_better_and_the_worse_are_counted(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from esp_cli.reporting.collect import RunCurve, collect_runs, read_curve
 from esp_cli.reporting.study_figures import draw_curves
 from esp_cli.reporting.tables import TABLES
 from esp_cli.training.run_folder import RunFolder
+from esp_envs.errors import UserError
 from tests.training.runs import tiny_config, tiny_folder
 
 NAN = math.nan
@@ -77,6 +78,22 @@ def test_the_nearest_evaluation_counts_and_none_where_the_run_did_not_get_there(
     further = replace(one, trained=1700).until(1650)
     assert further is not None
     assert further.last_step == 1600
+
+
+def test_runs_are_compared_where_all_were_evaluated():
+    often = curve([[-9.0], [-8.0], [-7.0], [-6.0]], "often", (0, 6400, 12800, 22400), seeds=(0,))
+    seldom = curve([[-9.0], [-4.0]], "seldom", (0, 64000), seeds=(0,))
+    with pytest.raises(UserError, match=r"no like steps: often at 0, 6\.4k, 12\.8k, 22\.4k; seldom at 0, 64k; train"):
+        gathered([often, seldom])
+    with pytest.raises(UserError, match=r"not evaluated at like steps near 20k: .*; give an --at near which all"):
+        gathered([often, seldom], at=[20_000])
+    near = replace(seldom, steps=np.array([0, 6500]), trained=40_000)
+    found = compare([often, near], [], [])
+    # the last step at which both have an evaluation within a tenth: 6.5k of one, 6.4k of the other
+    assert [list(cells) for cells in found.values()] == [[6500], [6500]]
+    assert [found[name][6500]["returns"]["greedy"] for name in found] == [[-8.0], [-4.0]]
+    with pytest.raises(UserError, match=r"none of these runs got to step 70k: often at .*; give an earlier --at"):
+        gathered([often, seldom], at=[70_000])
 
 
 def test_each_run_says_how_many_episodes_are_behind_its_returns():

@@ -275,7 +275,7 @@ def test_damaged_metrics_are_not_taken_for_a_run_that_has_only_begun(tmp_path):
 def test_runs_of_other_seeds_than_the_study_are_told(tmp_path):
     folder = write_study(tmp_path / "s", small_study(), {"MAPPO": PLAIN})
     document = json.loads((folder.path / "study.json").read_text())
-    document["cells"][0]["config"]["seeds"] = [0, 1, 2, -1]
+    document["cells"][0]["config"]["seeds"] = [0, 1, 2, 3]
     (folder.path / "study.json").write_text(json.dumps(document))
     more = StudyFolder.open(folder.path)
     with pytest.raises(ValueError, match="its final evaluation has not the 4 seeds of the run"):

@@ -35,6 +35,13 @@ def test_a_study_grows_by_cells_and_keeps_the_others(tmp_path):
     assert StudyFolder.open(tmp_path / "s").study == more
 
 
+def test_a_study_that_keeps_no_others_holds_what_was_planned_last(tmp_path):
+    StudyFolder.create(tmp_path / "s", small_study(command="esp a"))
+    study = small_study(tasks=("predator-prey",), command="esp b")
+    assert StudyFolder.create(tmp_path / "s", study, keep=False).study == study
+    assert StudyFolder.open(tmp_path / "s").study == study
+
+
 @pytest.mark.parametrize(
     ("kind", "choice"),
     [("table1", {"seeds": (0,)}), ("table1", {"overrides": {}}), ("table1", {"episodes": 5}), ("agents", {})],

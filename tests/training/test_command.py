@@ -34,6 +34,13 @@ def test_the_command_line_trains_the_same_run(tmp_path, choice):
     assert {k: v for k, v in made.items() if k not in ("format", "version", "run_id")} == config.model_dump(mode="json")
 
 
+def test_a_decision_on_kernels_that_another_setting_changes_is_written():
+    config = tiny_config(steps=200_000, network__layer_norm=True)
+    decided = config.model_copy(update={"network": config.network.model_copy(update={"compiled": True})})
+    assert "network.compiled=true" in decided.command()
+    assert "network.compiled" not in config.command()
+
+
 def test_what_a_shell_would_take_apart_is_quoted_and_a_text_like_a_number_stays_a_text():
     config = tiny_config(steps=50).model_copy(update={"task_settings": {"name": "a b; $(rm)", "number": "1"}})
     words = shlex.split(config.command())
