@@ -24,7 +24,7 @@ def test_a_null_device_takes_json_and_stays_a_device() -> None:
 def test_a_full_device_is_a_failure_of_the_machine() -> None:
     code, sentence = told("tasks", "navigation", "--json", "/dev/full")
     assert code == 1
-    assert sentence.endswith("free some space and run the command again\n")
+    assert sentence.endswith("free some space and run the command again, or resume it\n")
 
 
 @pytest.mark.parametrize("option", ["--out=", "--json=", "--results="])

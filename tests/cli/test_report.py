@@ -120,13 +120,13 @@ def test_two_runs_of_one_label_are_refused(finished: Path, tmp_path: Path) -> No
 
 
 def test_one_seed_and_a_step_not_reached_are_dashes(tmp_path: Path, finished: Path) -> None:
-    one = train_tiny(tmp_path / "one", "--seed-list", "3", steps=50)
-    told = esp("report", "--full", one, finished, "--at", "50", "--at", "9k", "--json", tmp_path / "report.json")
+    one = train_tiny(tmp_path / "one", "--seed-list", "3", steps=100)
+    told = esp("report", "--full", one, finished, "--at", "100", "--at", "150", "--json", tmp_path / "report.json")
     rows = [cells(line) for line in told.stdout.splitlines() if line.startswith("│ navigation, ")]
-    assert rows[0][:3] == ["navigation, 50", "one", "50"]
+    assert rows[0][:3] == ["navigation, 100", "one", "100"]
     assert "±" not in rows[0][3]
     assert rows[0][4] == "-"
-    assert rows[2] == ["navigation, 9k", "one", "50", "at 50", "-", "-", "-", "-", "-"]
+    assert rows[2] == ["navigation, 150", "one", "100", "at 100", "-", "-", "-", "-", "-"]
     assert ["runs finished", "2 of 2"] in [cells(line) for line in told.stdout.splitlines()], "not of four columns"
     one, _, ahead = json.loads((tmp_path / "report.json").read_text())["cells"][:3]
     assert (one["summary"]["returns"]["sem"], one["summary"]["returns"]["ci95"]) == (None, None)
