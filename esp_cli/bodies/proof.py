@@ -44,6 +44,7 @@ class Proof:
         worst: the largest gap of a state with any of these.
         sensors: by name, the gap of a sensor's readings, turned as fits best, from those of its image, the sensor of
             its kind that fits best: a share of their own spread, without constraints.
+        one_sided: pairs of bodies that may touch, as "left_leg and right_leg", where their images may not.
         unjudged: kinds of sensors that are not compared: they show nothing without constraints, as those of touch, or
             attitudes, or are of `NO_MIRROR`.
     """
@@ -56,6 +57,7 @@ class Proof:
     worst: float
     sensors: Mapping[str, float]
     unjudged: tuple[str, ...]
+    one_sided: tuple[str, ...]
 
     @property
     def gap(self) -> float:
@@ -73,12 +75,13 @@ class Proof:
         if not self.gap <= NEARLY:  # nor NaN
             return "broken"
         most = np.max([self.gap, self.worst, *self.sensors.values()])  # may be NaN
-        return "broken sensors" if self.broken_sensors else "exact" if most <= EXACT else "nearly"
+        is_exact = most <= EXACT and not self.one_sided
+        return "broken sensors" if self.broken_sensors else "exact" if is_exact else "nearly"
 
     @property
     def summary(self) -> dict[str, Any]:
         """The verdict and all gaps, as JSON takes them."""
-        names = ("gap", "median", "constraints", "contacts", "worst", "sensors", "unjudged")
+        names = ("gap", "median", "constraints", "contacts", "worst", "sensors", "unjudged", "one_sided")
         gaps = {name: getattr(self, name) for name in names}
         return {"verdict": self.verdict, **gaps, "smallest_planted": float(self.planted.min())}
 
@@ -125,7 +128,16 @@ def prove(frame: Frame, match: Match, seed: int = 0) -> Proof:
     held = [_gaps(frame, match, *pair)[1] for pair in pairs]
     median, *medians = (float(np.median(gaps)) for gaps in (free, *held))
     worst, sensors = float(np.concatenate(held).max()), _sensors(frame.model, here, there)
-    return Proof(joints, np.array(planted), median, medians[0], medians[1] if lying else None, worst, *sensors)
+    return Proof(
+        joints,
+        np.array(planted),
+        median,
+        medians[0],
+        medians[1] if lying else None,
+        worst,
+        *sensors,
+        _one_sided(frame, match),
+    )
 
 
 def _state(frame: Frame, data: Any, rng: np.random.Generator) -> Sample:
@@ -212,6 +224,26 @@ def _sensors(model: Any, here: Floats, there: Floats) -> tuple[dict[str, float],
             left = float((size[k] + there_size - 2 * fit).min() / size[k])
             found[printable(model.sensor(s).name or f"sensor {s}")] = max(left, 0.0) ** 0.5
     return found, tuple(sorted(unjudged))
+
+
+def _one_sided(frame: Frame, match: Match) -> tuple[str, ...]:
+    """Return the pairs of bodies that may touch where their images may not, as an exclusion or a mask makes them."""
+    model = frame.model
+    masks = model.geom_contype[:, None] & model.geom_conaffinity
+    one, other = np.nonzero(masks | masks.T)
+    may, excluded = np.zeros((2, model.nbody, model.nbody), dtype=bool)
+    excluded[model.exclude_signature >> 16, model.exclude_signature & 0xFFFF] = True
+    bodies, owner = model.geom_bodyid, model.body_weldid  # what is fixed to a body moves with it
+    listed = ~(excluded | excluded.T)[bodies[one], bodies[other]]
+    may[owner[bodies[one[listed]]], owner[bodies[other[listed]]]] = True
+    for body, parent in frame.parent.items():  # these touch nowhere, unless the parent is the world
+        may[body, parent] = may[parent, body] = may[body, parent] and not parent
+    may[owner[bodies[model.pair_geom1]], owner[bodies[model.pair_geom2]]] = True
+    may |= may.T
+    image = np.r_[0, match.bodies.argmax(0)[1:]]
+    moving = [0, *frame.moving]
+    pairs = ((b, c) for b in moving for c in moving if b < c and may[b, c] and not may[image[b], image[c]])
+    return tuple(" and ".join(printable(frame.name("body", b)) for b in pair) for pair in pairs)
 
 
 def _mistakes(frame: Frame, match: Match, joint: int) -> Iterator[Match]:

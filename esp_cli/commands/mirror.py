@@ -183,6 +183,8 @@ def _print(body: Body, model: Path) -> None:
             more = f" and {len(lost) - _SENSORS} more" if len(lost) > _SENSORS else ""
             told = ", ".join(lost[:_SENSORS]) + more
             console.say(f"  no sensor is the image of {told}; in brackets, how far off, as a share of its spread")
+        if one.proof.one_sided:
+            console.say(f"  on one side alone may touch: {', '.join(one.proof.one_sided)}")
         if one.proof.unjudged:
             console.say(f"  not judged: sensors of the kinds {', '.join(one.proof.unjudged)}")
         if unseen := [joint for joint, _, _, _, planted, _ in body.rows(name) if not one.proof.would_show(planted)]:

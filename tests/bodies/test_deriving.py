@@ -330,3 +330,15 @@ def test_servos_that_stand_in_another_order_on_each_side_have_their_images():
     )
     assert body.group == "flip-x"
     assert body.found["flip-x"].match.ctrl.tolist() == [[0, 0, 0, 1], [0, 0, 1, 0], [0, 1, 0, 0], [1, 0, 0, 0]]
+
+
+def test_what_may_touch_on_one_side_alone_is_not_exact():
+    def excluding(*sides: str) -> Proof:
+        pairs = "".join(f'<exclude body1="chest" body2="{side}_foot"/>' for side in sides)
+        text = biped().replace("<actuator>", f"<contact>{pairs}</contact><actuator>")
+        return body_of(text).found["flip-x"].proof
+
+    assert (excluding("left", "right").one_sided, excluding("left", "right").verdict) == ((), "exact")
+    # the right foot may touch the chest, and its image, the left foot, may not
+    assert excluding("left").one_sided == ("chest and right_foot",)
+    assert excluding("left").verdict == "nearly"
