@@ -85,8 +85,8 @@ TASKS: Mapping[str, Board] = {
     "predator-prey": _PREDATOR_PREY,
     "wildlife": Board("wildlife", networks=("mpn", "empn")),
     "formation": Board("formation", {"evaluation.every_steps": 20_000}, 200_000, 500_000),
-    "vmas-navigation": Board(f"{_VMAS}:Navigation"),
-    "vmas-dispersion": Board(f"{_VMAS}:Dispersion"),
+    "vmas-navigation": Board(f"{_VMAS}:Navigation", trial_steps=20_000, steps=60_000),  # learned in 30k
+    "vmas-dispersion": Board(f"{_VMAS}:Dispersion", trial_steps=40_000, steps=120_000),
     **{
         f"{board.task}-{way}": replace(board, settings=settings)
         for board in (_NAVIGATION, _PREDATOR_PREY)
