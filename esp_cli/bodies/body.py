@@ -65,6 +65,8 @@ class Body:
         ends = list(dict.fromkeys(name for pair in pairs for name in pair))
         self._numbers: dict[str, int] = {}
         self._base: tuple[Parts, Parts] | None = None
+        self._stateless = "a body that is given by names has no state; make it of a model"  # why `state` has no layout
+        self._is_turned = False  # whether the base's axes at rest are not the world's
         self.found: dict[str, Found] = {}
         self.refused: dict[str, str] = {}
         self._set(named, named, named, named_parts("limbs", ends, limbs or {}))
@@ -138,6 +140,16 @@ class Body:
             rates = {"velocity": slice(v, v + 3), "spin": slice(v + 3, v + 6)}
             moves = self._positions.moves, self._velocities.moves
             self._base = Parts("base's", places, moves[0]), Parts("base's", rates, moves[1])
+            self._is_turned = not np.allclose(frame.axes, np.eye(3), atol=1e-6)
+        first = 0 if frame.base is None else frame.qpos_of(frame.base).start
+        shifted = [n for n in names if any(np.any(m.offset[frame.qpos_of(names[n])]) for m in matches.values())]
+        self._stateless = (
+            "the free joint is not the first of the model, so its state has no layout"
+            if first
+            else f"{printable(shifted[0])} has a reference that is not its image's, so its state has no layout"
+            if shifted
+            else ""
+        )
         return self
 
     @property
@@ -175,15 +187,15 @@ class Body:
         Raises:
             UserError: a joint is unknown, or its image is not among them.
         """
-        return self._positions.field(name, joints or self.joints, history)
+        return self._positions.field(name, self.joints if joints is None else joints, history)
 
     def velocities(self, joints: Sequence[str] | None = None, history: int = 1, name: str = "velocities") -> Field:
         """Return the field of joint velocities, accelerations or torques, see `positions`."""
-        return self._velocities.field(name, joints or self.joints, history)
+        return self._velocities.field(name, self.joints if joints is None else joints, history)
 
     def controls(self, actuators: Sequence[str] | None = None, history: int = 1, name: str = "controls") -> Field:
         """Return the field of controls by actuator: targets, or the last action; see `positions`."""
-        return self._controls.field(name, actuators or self.actuators, history)
+        return self._controls.field(name, self.actuators if actuators is None else actuators, history)
 
     def contacts(self, limbs: Sequence[str], width: int = 1, history: int = 1, name: str = "contacts") -> Field:
         """Return the field of numbers by limb: contacts, air times, phases (`width` 2: cosine and sine).
@@ -204,7 +216,10 @@ class Body:
 
     @staticmethod
     def velocity(history: int = 1, name: str = "velocity") -> Field:
-        """Return the field of the base's velocity (m/s) or another vector, as the body or the world sees it."""
+        """Return the field of the base's velocity (m/s) or another vector, as the body sees it.
+
+        Where the base's axes at rest are the world's, also as the world sees it.
+        """
         return Field(name, kinds.VECTOR_3D, history)
 
     @staticmethod
@@ -212,9 +227,14 @@ class Body:
         """Return the field of the base's angular velocity (rad/s), or of a torque."""
         return Field(name, kinds.AXIAL_3D, history)
 
-    @staticmethod
-    def attitude(kind: Kind = kinds.QUATERNION, history: int = 1, name: str = "attitude") -> Field:
-        """Return the field of the base's attitude: a quaternion (w, x, y, z), or another kind of attitude."""
+    def attitude(self, kind: Kind = kinds.QUATERNION, history: int = 1, name: str = "attitude") -> Field:
+        """Return the field of the base's attitude: a quaternion (w, x, y, z), or another kind of attitude.
+
+        Raises:
+            UserError: the base's axes at rest are not the world's.
+        """
+        if self._is_turned:
+            raise UserError("the base is turned at rest, so attitudes do not follow; leave its quat or euler out")
         return Field(name, kind, history)
 
     @staticmethod
@@ -226,16 +246,15 @@ class Body:
         """Return the layout of MuJoCo's qpos and qvel: `simulated` of a task, whose states checks can pair.
 
         Raises:
-            UserError: the body is not that of a model, or its free joint is not the first.
+            UserError: the body is not that of a model, its free joint is not the first, or a joint's reference is not
+                that of its image.
         """
-        if not self._numbers and self._base is None:
-            raise UserError("a body that is given by names has no state; make it of a model")
+        if self._stateless:
+            raise UserError(self._stateless)
         fields = []
         for k, joints in enumerate((self._positions, self._velocities)):
             if self._base is not None:
                 base = self._base[k]
-                if min(span.start for span in base.places.values()):
-                    raise UserError("the free joint is not the first of the model, so its state has no layout")
                 fields += [base.field(name, [name], 1) for name in base.places]
             if self.joints:
                 fields.append(joints.field(("positions", "velocities")[k], self.joints, 1))

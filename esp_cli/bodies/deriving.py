@@ -33,6 +33,7 @@ class Match:
     """What one element does to a model's state: qpos' = qpos qpos + offset, qvel' = qvel qvel, ctrl' = ctrl ctrl."""
 
     element: PlaneElement
+    world: Floats  # [3, 3] what it does to the world at rest
     bodies: Floats  # [bodies, bodies] where each goes; a column of 0 where it has no image
     joint: Indices  # [joints] the image of each joint
     qpos: Floats  # [nq, nq]
@@ -65,7 +66,7 @@ def derive(frame: Frame, element: PlaneElement) -> Match:
     qpos, offset, qvel = _state_maps(frame, R, joints)
     ctrl, unmatched = _control_map(frame, qvel)
     joint = np.array([joints[j] for j in range(frame.model.njnt)])
-    return Match(element, _all_bodies(frame, R, bodies), joint, qpos, offset, qvel, ctrl, unmatched)
+    return Match(element, R, _all_bodies(frame, R, bodies), joint, qpos, offset, qvel, ctrl, unmatched)
 
 
 def _matched(frame: Frame, R: Floats) -> tuple[dict[int, int], dict[int, int]]:
@@ -174,6 +175,7 @@ def _control_map(frame: Frame, qvel: Floats) -> tuple[Floats, tuple[str, ...]]:
     gaps = np.abs(image[:, None] - np.stack([unit, -unit])[:, None]).max(-1, initial=0)
     gap = gaps.min(0) + _APART * (types[:, None] != types).any(-1)
     gap += 0.1 * np.abs(np.subtract.outer(scale, scale)) / max(scale.max(initial=0), 1e-12)
+    gap += 1e-9 * (gaps[0] > gaps[1])  # two that pull one joint opposite ways: each has an image of its own sense
     gap += _UNLIKE * (servos[:, None] != servos).any(-1)
     mirrored = [a for a in range(model.nu) if scale[a] > 0]
     unmatched = {a for a in range(model.nu) if scale[a] == 0}

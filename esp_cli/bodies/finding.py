@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 
 import mujoco
@@ -27,6 +27,9 @@ TRIED = tuple(
     )
 )
 """The elements that a model is searched for: turns by 1/2 to 1/8, and mirrors in lines between which such turns lie."""
+
+LIMITS = ("range", "stops", "torque range", "force range", "control range", "activation range", "early activation")
+"""Properties that accelerations show only where a state reaches them."""
 
 
 @dataclass(frozen=True)
@@ -74,8 +77,19 @@ def find(frame: Frame, tolerated: float) -> tuple[dict[PlaneElement, Found], dic
         elif not proof.gap <= tolerated:  # nor NaN
             worst = printable(frame.name("joint", int(proof.joints.argmax())))
             refused[element.name] = f"accelerations of {worst} differ by {proof.gap:.2g} of their size"
+        elif not proof.constraints <= tolerated:
+            refused[element.name] = (
+                f"with limits, friction and equalities accelerations differ by {proof.constraints:.2g}"
+            )
         else:
             differ = differences(frame, match)
+            limits = [
+                f"{what} of {printable(frame.name('joint', j))}"
+                for j, one in enumerate(differ)
+                for what in LIMITS
+                if one.shares.get(what, 0.0) > EXACT
+            ]
+            proof = replace(proof, unlike=(*proof.unlike, *limits))
             found[element] = Found(match, proof, differ, None if frame.base is None else differ[frame.base])
     while lost := _outside(found, idle):
         del found[lost]
@@ -129,6 +143,10 @@ def _of_joint(frame: Frame, R: Floats, i: int, j: int) -> dict[str, float]:
         shares["axis"] = float(np.linalg.norm(axis - sign * frame.axis[j]))
         limits = [model.jnt_range[k] * model.jnt_limited[k] - model.qpos0[frame.qpos_of(k)] for k in (i, j)]
         shares["range"] = _share(np.sort(sign * limits[0]), limits[1])
+        stops = [np.r_[model.jnt_solref[k], model.jnt_solimp[k], model.jnt_margin[k]] for k in (i, j)]
+        shares["stops"] = _share(*stops) if model.jnt_limited[i] or model.jnt_limited[j] else 0.0
+        torques = [model.jnt_actfrcrange[k] * model.jnt_actfrclimited[k] for k in (i, j)]
+        shares["torque range"] = _share(np.sort(sign * torques[0]), torques[1])
     return shares
 
 
@@ -147,10 +165,11 @@ def _of_shapes(frame: Frame, R: Floats, b: int, c: int) -> float:
 
 def _of_actuator(frame: Frame, match: Match, a: int) -> dict[str, float]:
     model, b = frame.model, int(np.abs(match.ctrl[:, a]).argmax())
-    names = {"gain": "gainprm", "bias": "biasprm", "force range": "forcerange", "control range": "ctrlrange"}
+    names = {"gain": "gainprm", "bias": "biasprm", "early activation": "actearly"}
     values = {what: getattr(model, f"actuator_{name}")[[a, b]] for what, name in names.items()}
-    for what in ("force range", "control range"):
-        values[what] = [np.sort(match.ctrl[b, a] * values[what][0]), values[what][1]]
+    for what, name in (("force range", "force"), ("control range", "ctrl"), ("activation range", "act")):
+        limits = getattr(model, f"actuator_{name}range") * getattr(model, f"actuator_{name}limited")[:, None]
+        values[what] = [np.sort(match.ctrl[b, a] * limits[a]), limits[b]]
     values["gear"] = np.abs(model.actuator_gear[[a, b]])
     return {what: _share(*pair) for what, pair in values.items()}
 

@@ -20,7 +20,7 @@ QPOS_WIDTH, DOF_WIDTH = (7, 4, 1, 1), (6, 3, 1, 1)  # numbers of a joint's posit
 
 
 class Frame:
-    """A model at rest: where its joints and masses are, all seen from the middle of its base, its first free joint.
+    """A model at rest: where its joints and masses are, all seen from the middle of its base, its heaviest free body.
 
     Mirrors and turns leave `centre` [3] where it is; its z is 0. `axes` [3, 3] are the base's own, in columns: elements
     are told by them. `size` is the largest distance of a joint or mass from their middle, m. `places` [bodies, 2, 3]
@@ -34,6 +34,7 @@ class Frame:
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         free = [j for j in range(model.njnt) if model.jnt_type[j] == FREE]
+        free.sort(key=lambda j: -model.body_subtreemass[model.jnt_bodyid[j]])
         self.base = free[0] if free else None
         self.moving = [b for b in range(1, model.nbody) if model.body_jntnum[b]]
         self.parent = {b: self.carrier(b) for b in self.moving}

@@ -44,7 +44,7 @@ class _OfModel(ParallelTask):
     """Elements that the reward leaves alone; those of them that the model has are the task's symmetry."""
     exact: ClassVar[bool] = True
     """Whether the model is its own mirror image to the last digit; else these hold only nearly."""
-    _known: ClassVar[dict[tuple[type, str], Layouts]] = {}
+    _known: ClassVar[dict[tuple[type, str], tuple[Layouts, float]]] = {}  # and the time of a step, s
 
     def __init__(self, settings: TaskSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
         self.settings = settings  # type: ignore[assignment] # of this task
@@ -52,14 +52,18 @@ class _OfModel(ParallelTask):
         if key not in self._known:
             with quiet():
                 env = self.make_one()
-                self._known[key] = self._layouts(env)
+                self._known[key] = self._layouts(env), float(self._robot(env).dt)
             env.close()
-        known = self._known[key]
+        known, self.control_period_s = self._known[key]
         self.observation, self.action, self.simulated = known.observation, known.action, known.simulated
         held = [Element((g,), order) for g, order in known.orders.items() if g.name in self.keeps]
         found = ",".join(element.name for element in held) or "c1"
         self.symmetry, self.nearly = (found, "") if self.exact else ("c1", found)
         super().__init__(settings, num_envs, generators)
+
+    def _robot(self, env: Any) -> Any:
+        """Return Gymnasium's environment of the robot of a copy."""
+        return env.unwrapped
 
     def _layouts(self, env: Any) -> Layouts:
         """Return the layouts of a copy, which may be overwritten."""
@@ -100,11 +104,14 @@ class MujocoTeam(_OfModel):
     def make_one(self) -> Any:
         make = _module("gymnasium_robotics").mamujoco_v1.parallel_env
         env = make(self.scenario, self.parts, max_episode_steps=self.settings.horizon, **self.arguments)
-        robot = env.single_agent_env.unwrapped
+        robot = self._robot(env)
         # where checks and pictures look for them
         env.data, env.model, env.set_state = robot.data, robot.model, robot.set_state
         env.render_mode, env.render = "rgb_array", painter_of(robot)
         return env
+
+    def _robot(self, env: Any) -> Any:
+        return env.single_agent_env.unwrapped
 
     def _layouts(self, env: Any) -> Layouts:
         agents, count = env.possible_agents, env.model.nu

@@ -134,6 +134,8 @@ def grid(size: tuple[float, float], resolution: float, ordering: str = "xy") -> 
     """
     if ordering not in ("xy", "yx") or resolution <= 0 or min(size) < 0:
         raise UserError(f"grid({size}, {resolution}, {ordering!r}) is none; give sizes, a resolution and 'xy' or 'yx'")
+    if any(abs(s / resolution - round(s / resolution)) > 1e-6 for s in size):
+        raise UserError(f"grid({size}, {resolution}): no mirror keeps points that miss the edge; give multiples of it")
     x, y = (np.linspace(-s / 2, s / 2, round(s / resolution) + 1) for s in size)
     X, Y = np.meshgrid(x, y, indexing="xy" if ordering == "xy" else "ij")
     return np.stack([X.ravel(), Y.ravel()], -1)

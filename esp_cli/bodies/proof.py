@@ -44,7 +44,8 @@ class Proof:
         worst: the largest gap of a state with any of these.
         sensors: by name, the gap of a sensor's readings, turned as fits best, from those of its image, the sensor of
             its kind that fits best: a share of their own spread, without constraints.
-        one_sided: pairs of bodies that may touch, as "left_leg and right_leg", where their images may not.
+        unlike: what is not as that of its image, though no state need show it: contacts of bodies that may touch, where
+            their images may not, limits of joints and actuators.
         unjudged: kinds of sensors that are not compared: they show nothing without constraints, as those of touch, or
             attitudes, or are of `NO_MIRROR`.
     """
@@ -57,7 +58,7 @@ class Proof:
     worst: float
     sensors: Mapping[str, float]
     unjudged: tuple[str, ...]
-    one_sided: tuple[str, ...]
+    unlike: tuple[str, ...]
 
     @property
     def gap(self) -> float:
@@ -75,13 +76,13 @@ class Proof:
         if not self.gap <= NEARLY:  # nor NaN
             return "broken"
         most = np.max([self.gap, self.worst, *self.sensors.values()])  # may be NaN
-        is_exact = most <= EXACT and not self.one_sided
+        is_exact = most <= EXACT and not self.unlike
         return "broken sensors" if self.broken_sensors else "exact" if is_exact else "nearly"
 
     @property
     def summary(self) -> dict[str, Any]:
         """The verdict and all gaps, as JSON takes them."""
-        names = ("gap", "median", "constraints", "contacts", "worst", "sensors", "unjudged", "one_sided")
+        names = ("gap", "median", "constraints", "contacts", "worst", "sensors", "unjudged", "unlike")
         gaps = {name: getattr(self, name) for name in names}
         return {"verdict": self.verdict, **gaps, "smallest_planted": float(self.planted.min())}
 
@@ -122,22 +123,18 @@ def prove(frame: Frame, match: Match, seed: int = 0) -> Proof:
     lying = [sample for sample in lowered if sample is not None]
     pairs = [
         [_accelerations(frame, data, states, flag | _NO_SENSORS) for states in (some, moved)]
-        for some, moved, flag in ((samples, images, _NO_CONTACTS), (lying, _images(match, lying), 0))
+        for some, moved, flag in (
+            (samples, images, _NO_CONTACTS),
+            (samples, images, 0),
+            (lying, _images(match, lying), 0),
+        )
         if some
     ]
     held = [_gaps(frame, match, *pair)[1] for pair in pairs]
     median, *medians = (float(np.median(gaps)) for gaps in (free, *held))
     worst, sensors = float(np.concatenate(held).max()), _sensors(frame.model, here, there)
-    return Proof(
-        joints,
-        np.array(planted),
-        median,
-        medians[0],
-        medians[1] if lying else None,
-        worst,
-        *sensors,
-        _one_sided(frame, match),
-    )
+    lain = medians[2] if lying else None
+    return Proof(joints, np.array(planted), median, medians[0], lain, worst, *sensors, _unlike_contacts(frame, match))
 
 
 def _state(frame: Frame, data: Any, rng: np.random.Generator) -> Sample:
@@ -226,24 +223,25 @@ def _sensors(model: Any, here: Floats, there: Floats) -> tuple[dict[str, float],
     return found, tuple(sorted(unjudged))
 
 
-def _one_sided(frame: Frame, match: Match) -> tuple[str, ...]:
+def _unlike_contacts(frame: Frame, match: Match) -> tuple[str, ...]:
     """Return the pairs of bodies that may touch where their images may not, as an exclusion or a mask makes them."""
     model = frame.model
     masks = model.geom_contype[:, None] & model.geom_conaffinity
-    one, other = np.nonzero(masks | masks.T)
-    may, excluded = np.zeros((2, model.nbody, model.nbody), dtype=bool)
-    excluded[model.exclude_signature >> 16, model.exclude_signature & 0xFFFF] = True
-    bodies, owner = model.geom_bodyid, model.body_weldid  # what is fixed to a body moves with it
-    listed = ~(excluded | excluded.T)[bodies[one], bodies[other]]
-    may[owner[bodies[one[listed]]], owner[bodies[other[listed]]]] = True
-    for body, parent in frame.parent.items():  # these touch nowhere, unless the parent is the world
-        may[body, parent] = may[parent, body] = may[body, parent] and not parent
-    may[owner[bodies[model.pair_geom1]], owner[bodies[model.pair_geom2]]] = True
-    may |= may.T
-    image = np.r_[0, match.bodies.argmax(0)[1:]]
-    moving = [0, *frame.moving]
-    pairs = ((b, c) for b in moving for c in moving if b < c and may[b, c] and not may[image[b], image[c]])
-    return tuple(" and ".join(printable(frame.name("body", b)) for b in pair) for pair in pairs)
+    one, other = (model.geom_bodyid[geoms] for geoms in np.nonzero(masks | masks.T))
+    may = np.zeros((model.nbody, model.nbody), dtype=bool)
+    may[one, other] = True
+    may[model.exclude_signature >> 16, model.exclude_signature & 0xFFFF] = False
+    owner = model.body_weldid  # what is fixed to a body moves with it, and touches neither it nor its parent
+    parent = np.where(owner > 0, owner[model.body_parentid[owner]], -1)
+    may &= (owner[:, None] != owner) & ~((parent[:, None] == owner) & (owner > 0))
+    may &= may.T
+    pairs = model.geom_bodyid[[model.pair_geom1, model.pair_geom2]]
+    may[pairs, pairs[::-1]] = True
+    image = np.where(match.bodies.any(0), match.bodies.argmax(0), -1)
+    image[0] = 0
+    known = [b for b in range(model.nbody) if image[b] >= 0]
+    lost = [(b, c) for b in known for c in known if b < c and may[b, c] and not may[image[b], image[c]]]
+    return tuple("contact of " + " and ".join(printable(frame.name("body", b)) for b in pair) for pair in lost)
 
 
 def _mistakes(frame: Frame, match: Match, joint: int) -> Iterator[Match]:

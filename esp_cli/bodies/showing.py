@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -47,14 +47,16 @@ def layouts_of(
     for one in body.found.values():
         match, element = one.match, one.match.element
         whose = [next((k for k, a in enumerate(acts) if match.ctrl[a][:, own].any()), 0) for own in acts]
-        bodies = [np.kron(match.bodies, KIND_MATRICES[kind](element.matrix)) for kind in _OF_BODIES.values()]
+        bodies = [np.kron(match.bodies, KIND_MATRICES[kind](match.world[:2, :2])) for kind in _OF_BODIES.values()]
         blocks = _common(block_diag(match.qpos, match.qvel, match.qvel, *bodies), seen, whose)
         moves = _common(match.ctrl, acts, whose)
         if blocks is not None and moves is not None and len(set(whose)) == len(acts):
             orders[element], shown[element], done[element] = tuple(whose), blocks, moves
     controls = [f"control_{k}" if len(acts) > 1 else body.actuators[k] for k in acts[0]]
     observation = _split([names[k] for k in seen[0]], shown, len(acts) == 1)
-    action = Continuous(Layout((parts_field("controls", "actuators", controls, done, 1),)))
+    ranges = data.model.actuator_ctrlrange[acts[0]]
+    unit = f"share of {ranges[0, 0]:g} to {ranges[0, 1]:g}" if np.ptp(ranges, 0).max() == 0 else "share of its range"
+    action = Continuous(Layout((replace(parts_field("controls", "actuators", controls, done, 1), unit=unit),)))
     return Layouts(observation, action, body.state(), orders)
 
 

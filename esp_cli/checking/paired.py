@@ -34,7 +34,9 @@ _NUMBERS = 1 << 18  # that all worlds together may show their agents at once; wi
 _SOME = 8  # of more elements than these, each is first tried in one of so many states
 _FURTHER = "holds where play went, but further out {} would differ"
 _HIDDEN = "the state leaves out {}, and later steps do not tell what that does"
-_LATER = 32  # steps of an episode that are followed from its start, for what builds up that no state holds
+_LATER, _LATER_OF_SLOW = 128, 32
+"""Steps of an episode that are followed from its start, for what builds up that no state holds; of slow simulators
+fewer."""
 _HERE, _THERE = (101, 102), (103, 104)  # seeds of two runs from the states, two from images, with own chance
 Visited = tuple[Tensor, Tensor]  # states [1, E, state width] and joint actions
 
@@ -71,6 +73,7 @@ class _Judge:
         self, make: MakeWorlds, spec: TaskSpec, moments: Sequence[Visited], slow: bool, until: float, quick: bool
     ) -> None:
         self._make, self._spec, self._moments, self._until, self._quick = make, spec, moments, until, quick
+        self._slow = slow
         states, actions = (torch.cat(part, 1) for part in zip(*moments, strict=True))
         self._visited = moments if slow else [(states, actions)]
         self._some = [(state[:, ::_SOME], action[:, ::_SOME]) for state, action in self._visited]
@@ -101,7 +104,8 @@ class _Judge:
         if spec.terminates or spec.masks or spec.agents_end:  # nobody knows what may be done later, or for how long
             return None
         actions = [action[:, ::_SOME] for _, action in self._moments]
-        count, start = min(_LATER, spec.horizon), self._moments[0][0][:, ::_SOME]
+        count = min(_LATER_OF_SLOW if self._slow else _LATER, spec.horizon)
+        start = self._moments[0][0][:, ::_SOME]
         return self._tried([(start, actions[k % len(actions)]) for k in range(count)], onwards=True)
 
     def _tried(self, visited: Sequence[Visited], onwards: bool = False) -> _Pairs | None:

@@ -25,7 +25,7 @@ EPILOG = """Examples:\n
     esp mirror robot.xml --order joints.txt --emit rsl_rl -o mirror.py\n
     esp check mirror symmetry:compute_symmetric_states robot.xml"""
 
-_SENSORS = 6  # that are named; the others are in the JSON
+_NAMED = 6  # of sensors and others; the others are in the JSON
 _SHOWN = 4  # elements that have a column in the table; the others are in the JSON
 
 
@@ -180,11 +180,11 @@ def _print(body: Body, model: Path) -> None:
         if one.base is not None and _differs(one.base):
             console.say(f"  the base differs from its image: {_differs(one.base)}")
         if lost := [f"{sensor} ({one.proof.sensors[sensor]:.2g})" for sensor in one.proof.broken_sensors]:
-            more = f" and {len(lost) - _SENSORS} more" if len(lost) > _SENSORS else ""
-            told = ", ".join(lost[:_SENSORS]) + more
-            console.say(f"  no sensor is the image of {told}; in brackets, how far off, as a share of its spread")
-        if one.proof.one_sided:
-            console.say(f"  on one side alone may touch: {', '.join(one.proof.one_sided)}")
+            console.say(
+                f"  no sensor is the image of {_some(lost)}; in brackets, how far off, as a share of its spread"
+            )
+        if one.proof.unlike:
+            console.say(f"  not as that of its image, where no state need show it: {_some(one.proof.unlike)}")
         if one.proof.unjudged:
             console.say(f"  not judged: sensors of the kinds {', '.join(one.proof.unjudged)}")
         if unseen := [joint for joint, _, _, _, planted, _ in body.rows(name) if not one.proof.would_show(planted)]:
@@ -203,6 +203,10 @@ def _print(body: Body, model: Path) -> None:
     console.table(("joint", *shown, "gap>", "differs"), rows, caption=caption)
     if len(body.found) > _SHOWN:
         console.note(f"--json has the tables of {', '.join(list(body.found)[_SHOWN:])} too")
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
 
 
 def _differs(difference: Difference) -> str:

@@ -51,8 +51,19 @@ def describe(trained: TrainedPolicy, program: Program, sample: Sample) -> dict[s
     }
 
 
-def _fields(layout: Layout) -> list[dict[str, str]]:
-    return [dict(zip(("index", "field", "kind", "unit"), row, strict=True)) for row in layout.table()]
+def _fields(layout: Layout) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = []
+    for row, parts in zip(layout.table(), _parts(layout), strict=True):
+        rows.append(
+            dict(zip(("index", "field", "kind", "unit"), row, strict=True)) | ({"parts": parts} if parts else {})
+        )
+    return rows
+
+
+def _parts(layout: Layout) -> list[tuple[str, ...]]:
+    """Return for each field what its numbers are called, as joints are."""
+    named = [tuple(getattr(field.kind, "parts", ())) for field in layout.fields]
+    return [parts if set(parts) - {f.name} else () for f, parts in zip(layout.fields, named, strict=True)]
 
 
 def _action(spec: TaskSpec) -> dict[str, Any]:
@@ -92,7 +103,8 @@ def spaces(spec: TaskSpec, program: Program) -> list[str]:
             f"The policy takes the {program.num_inputs} own numbers as its observation, and beside them a table "
             f"of each set, with a row for each thing, as many as there are, at least one; numbers of a row: {names}."
         )
-    lines += ["The frame is the world's: x to the right, y up, angles counter-clockwise in radians."]
+    if not any(hasattr(field.kind, "parts") for field in spec.observation.fields):  # a robot's numbers may be seen from its body
+        lines += ["The frame is the world's: x to the right, y up, angles counter-clockwise in radians."]
     lines.append("Action of one agent:")
     if isinstance(spec.action, Discrete):
         lines.append(f"  the index of one of {spec.action.count} options, each a {spec.action.kind.name}:")
@@ -110,7 +122,11 @@ def spaces(spec: TaskSpec, program: Program) -> list[str]:
 
 
 def _rows(layout: Layout) -> list[str]:
-    return [f"  {index:>7}  {name}: {kind}{f' ({unit})' if unit else ''}" for index, name, kind, unit in layout.table()]
+    rows = []
+    for (index, name, kind, unit), parts in zip(layout.table(), _parts(layout), strict=True):
+        names = f": {', '.join(parts[:_MOST_ROWS])}{', ...' if len(parts) > _MOST_ROWS else ''}" if parts else ""
+        rows.append(f"  {index:>7}  {name}: {kind}{f' ({unit})' if unit else ''}{names}")
+    return rows
 
 
 def shortly(values: Any) -> str:

@@ -185,7 +185,7 @@ class Search(RunSet):
             if (known is None or point.step > known) and math.isfinite(point.value):
                 trial.report(point.value, point.step)
                 known = point.step
-                if trial.number > 0 and point.step < self.tuning.steps and trial.should_prune():
+                if point.step < self.tuning.steps and trial.should_prune() and trial.number > 0:  # it sets the rungs
                     return False
         return True
 

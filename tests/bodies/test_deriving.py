@@ -338,7 +338,67 @@ def test_what_may_touch_on_one_side_alone_is_not_exact():
         text = biped().replace("<actuator>", f"<contact>{pairs}</contact><actuator>")
         return body_of(text).found["flip-x"].proof
 
-    assert (excluding("left", "right").one_sided, excluding("left", "right").verdict) == ((), "exact")
+    assert (excluding("left", "right").unlike, excluding("left", "right").verdict) == ((), "exact")
     # the right foot may touch the chest, and its image, the left foot, may not
-    assert excluding("left").one_sided == ("chest and right_foot",)
+    assert excluding("left").unlike == ("contact of chest and right_foot",)
     assert excluding("left").verdict == "nearly"
+
+
+_LIMITS = {
+    "force range of left_knee": ('<motor name="a_left_knee" ', '<motor name="a_left_knee" forcerange="-9 9" '),
+    "torque range of left_knee": ('<joint name="left_knee" ', '<joint name="left_knee" actuatorfrcrange="-9 9" '),
+    "control range of left_knee": ('<motor name="a_left_knee" ', '<motor name="a_left_knee" ctrlrange="-9 9" '),
+    "stops of left_knee": ('<joint name="left_knee" ', '<joint name="left_knee" solreflimit="0.1 1" '),
+}
+
+
+@pytest.mark.parametrize("what", _LIMITS)
+def test_a_limit_of_one_side_that_no_state_reaches_is_not_exact(what):
+    proof = body_of(biped().replace(*_LIMITS[what])).found["flip-x"].proof
+    assert (proof.verdict, proof.unlike) == ("nearly", (what, what.replace("left", "right")))
+
+
+def test_a_wall_beside_a_robot_that_is_fixed_is_not_exact():
+    arms = biped().replace('<freejoint name="root"/>', "").replace('<geom type="plane" size="5 5 1"/>', "{}")
+    assert body_of(arms.format("")).found["flip-x"].proof.verdict == "exact"
+    wall = '<geom type="box" size="1 0.01 1" pos="0 0.3 0.5"/>'
+    assert body_of(arms.format(wall)).found["flip-x"].proof.verdict == "nearly"
+
+
+def test_a_turn_that_limits_forbid_is_refused():
+    # Front and back hips and knees alike: accelerations are those of d2, but knees bend backward alone.
+    place = [(0.2, 0.1, 0), (0.2, -0.1, 0), (-0.2, 0.1, 0), (-0.2, -0.1, 0)]
+    body = body_of(legged(place).replace("0.2 0 0", "0 0 -0.2").replace("0.2 0 -0.05", "0 0 -0.2"))
+    assert body.group == "flip-x"
+    assert body.refused["flip-y"].startswith("with limits, friction and equalities accelerations differ by ")
+
+
+def test_two_motors_that_pull_a_joint_opposite_ways_change_places():
+    turret = (
+        '<mujoco><worldbody><body pos="0 0 1"><joint name="yaw" axis="0 0 1" damping="1"/>'
+        '<geom type="capsule" size="0.05" fromto="0 0 0 0.4 0 0"/></body></worldbody><actuator>'
+        '<motor name="left" joint="yaw" gear="2" ctrlrange="0 1"/>'
+        '<motor name="right" joint="yaw" gear="-2" ctrlrange="0 1"/></actuator></mujoco>'
+    )
+    assert body_of(turret).found["flip-x"].match.ctrl.tolist() == [[0, 1], [1, 0]]
+
+
+def test_of_two_free_bodies_the_heavier_is_the_base():
+    ball = '<body name="ball" pos="1 0 0.1"><freejoint/><geom type="sphere" size="0.05"/></body><body name="pelvis"'
+    text = biped().replace('<body name="pelvis"', ball)
+    frame = Frame(mujoco.MjModel.from_xml_string(text))
+    assert frame.name("joint", frame.base or 0) == "root"
+
+
+def test_a_base_that_is_turned_at_rest_has_no_attitude_and_shifted_joints_no_state():
+    turned = body_of(
+        biped().replace('<body name="pelvis" pos="0 0 1">', '<body name="pelvis" pos="0 0 1" euler="0 0 90">')
+    )
+    assert layout(turned.velocity(), turned.gravity())
+    with pytest.raises(UserError, match="the base is turned at rest, so attitudes do not follow"):
+        turned.attitude()
+    shifted = body_of(biped().replace('_roll" axis="1 0 0"', '_roll" axis="1 0 0" ref="10"'))
+    with pytest.raises(UserError, match="left_roll has a reference that is not its image's"):
+        shifted.state()
+    with pytest.raises(UserError, match="has no joints; name some"):
+        shifted.positions([])

@@ -36,6 +36,8 @@ class CopyHooks(ABC):
     nearly: str = ""
     """A larger symmetry that holds nearly, which a prior may use all the same."""
     convention: str
+    control_period_s: float = 0.1
+    """Time of a step, s."""
     state: Layout | None = None
     """What `env.state()` returns; by default the global state is all agents' observations, one after the other."""
     learners: str = ""

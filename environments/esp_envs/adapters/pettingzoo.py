@@ -104,6 +104,7 @@ class ParallelTask(CopyHooks, Environment):
             name=type(self).__name__.lower(),
             version=1,
             convention=self.convention,
+            control_period_s=self.control_period_s,
             horizon=self.settings.horizon,
             symmetry=self.symmetry,
             nearly=self.nearly,
