@@ -120,9 +120,11 @@ def collect_runs(
 ) -> Material:
     """Return runs of one task as a study whose panels are the steps at which they are compared."""
     _refuse_unlike(curves)
+    at = _compared_at(curves, at)
+    curves = [_thinned(curve, at, max(map(_apart, curves))) for curve in curves]
     first, *_ = curves
     cells, states, by_name = [], {}, {}
-    for step in _compared_at(curves, at):
+    for step in at:
         for k, curve in enumerate(curves):
             name, reference = f"{k}-{curve.label}-{step}", f"0-{first.label}-{step}" if k else None
             panel = f"{curve.config.task}, {format_exactly(step)}"
@@ -138,6 +140,20 @@ def collect_runs(
     )
     runs = {name: curve.path for name, curve in by_name.items()}
     return Material(study, _results(study, states, mode, thresholds), by_name, runs)
+
+
+def _apart(curve: RunCurve) -> float:
+    """Return how many steps lie between evaluations."""
+    return float(np.median(np.diff(curve.steps))) if len(curve.steps) > 1 else 0.0
+
+
+def _thinned(curve: RunCurve, at: Sequence[int], apart: float) -> RunCurve:
+    """Return a curve without evaluations that others lack: who is looked at more often seems to be there sooner."""
+    if _apart(curve) >= (1 - _LIKE) * apart:
+        return curve
+    marks = np.r_[np.arange(0, curve.last_step + 1, apart), at]
+    kept = np.unique(np.abs(curve.steps[:, None] - marks).argmin(0))
+    return replace(curve, steps=curve.steps[kept], values=curve.values[kept])
 
 
 def _compared_at(curves: Sequence[RunCurve], at: Sequence[int]) -> tuple[int, ...]:

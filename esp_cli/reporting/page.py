@@ -26,7 +26,7 @@ from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.policies.statistics import steps_to_threshold
 from esp_cli.reporting.collect import Material
 from esp_cli.reporting.figures import Style
-from esp_cli.reporting.results import RESULTS_FORMAT, CellResult, Results, Side
+from esp_cli.reporting.results import MIN_SEEDS_TO_RANK, RESULTS_FORMAT, CellResult, Results, Side
 from esp_cli.reporting.study_figures import draw_curves, draw_variants
 from esp_cli.reporting.tables import all_tables, markdown_text
 from esp_cli.studies.kinds import kind_of
@@ -165,21 +165,31 @@ def _outcome(material: Material) -> list[str]:
     finished = [cell for cell in results.cells if cell.summary is not None and cell.summary.returns.mean is not None]
     pairs = [(cell, other) for cell in finished if (other := results.reference_of(cell)) is not None]
     pairs = [(cell, other) for cell, other in pairs if other in finished]
-    if len(pairs) == 1:
+    stopped = [f"{c.variant}, {c.panel}" for c in results.cells if _has_stopped(c)]
+    left_out = [f"Not compared, since a seed stopped: {'; '.join(stopped)}."] if stopped else []
+    if len(pairs) == 1 and len(finished) == len(results.cells):
         both = pairs[0]
         return [_returns(results, *both), _verdict(*both), *_steps(material, *both)]
     if pairs and kind_of(results.kind).benchmark:
-        return [_ranking(panel, results) for panel in dict.fromkeys(cell.panel for cell, _ in pairs)]
+        return [_ranking(panel, results) for panel in dict.fromkeys(cell.panel for cell, _ in pairs)] + left_out
     texts = _count(pairs) if pairs else [_returns(results, cell) for cell in finished[:2]]
-    return texts or ["No run has a return yet."]
+    return [*texts, *left_out] or ["No run has a return yet."]
+
+
+def _has_stopped(cell: CellResult) -> bool:
+    """Whether a seed of a run has no return at the end."""
+    return any(None in values for values in cell.returns.values())
 
 
 def _ranking(panel: str, results: Results) -> str:
     """State which method of a panel is highest, and which are ahead of the reference or behind it."""
-    cells = [(cell, cell.summary) for cell in results.cells if cell.panel == panel and cell.summary is not None]
-    iqm, best = max((summary.iqm.value, cell.variant) for cell, summary in cells if summary.iqm is not None)
+    own = [cell for cell in results.cells if cell.panel == panel and not _has_stopped(cell)]
+    cells = [(cell, cell.summary) for cell in own if cell.summary is not None]
+    if not cells:
+        return f"{panel}: a seed of every method stopped, so none is ranked."
+    iqm, best = max((summary.iqm.value, cell.variant) for cell, summary in cells if summary.iqm)
     sides = {side: [c.variant for c, s in cells if s.gap is not None and s.gap.ahead == side] for side in _VERDICTS}
-    first = next(cell.variant for cell, _ in cells if cell.reference is None)
+    first = next(cell.variant for cell in results.cells if cell.panel == panel and cell.reference is None)
     counts = "; ".join(f"{_VERDICTS[side][3:]} {first}: {', '.join(names)}" for side, names in sides.items() if names)
     return (
         f"{panel}: {best} has the highest IQM, {iqm:.2f}; after Holm's correction, {counts or 'nothing is compared'}."
@@ -200,10 +210,12 @@ def _returns(results: Results, *cells: CellResult) -> str:
 
 def _verdict(cell: CellResult, other: CellResult) -> str:
     gap = None if cell.summary is None else cell.summary.gap
-    stopped = [one.variant for one in (cell, other) if any(None in values for values in one.returns.values())]
+    stopped = [one.variant for one in (cell, other) if _has_stopped(one)]
     if gap is None and stopped:
         seeds = f"a seed of {' and of '.join(stopped)} stopped"
         return f"There is no interval of the difference: {seeds}, and the others are no fair sample."
+    if gap is not None and gap.ahead is None and min(len(cell.seeds), len(other.seeds)) >= MIN_SEEDS_TO_RANK:
+        return f"{cell.variant} and {other.variant} differ by {gap.difference.value:+.2f} with every seed."
     if gap is None or gap.ahead is None:
         return "There is no interval of the difference, so this tells nothing for sure; take three seeds or more."
     interval = f"the difference is {gap.difference.value:+.2f}, 95 % interval {format_interval(gap.difference.ci95)}"
@@ -238,11 +250,13 @@ def _reached(results: Results, threshold: float) -> str:
 def _count(pairs: list[tuple[CellResult, CellResult]]) -> list[str]:
     gaps = [(cell, cell.summary.gap) for cell, _ in pairs if cell.summary is not None and cell.summary.gap is not None]
     sides = Counter(gap.ahead for _, gap in gaps)
-    if set(sides) == {None}:
+    if set(sides) <= {None}:
         return [_verdict(*pairs[0])]
     counts = f"better {sides['ahead']}, not told apart {sides['level']}, worse {sides['behind']}"
     counts += f", both below a policy that sees nothing {sides['blind']}" if sides["blind"] else ""
-    texts = [f"Of {len(pairs)} runs beside their reference: {counts} (95 % intervals of the difference)."]
+    texts = [
+        f"Of {sides.total() - sides[None]} runs beside their reference: {counts} (95 % intervals of the difference)."
+    ]
     if gaps:
         ordered = sorted(gaps, key=lambda pair: pair[1].difference.value)
         largest, smallest = (

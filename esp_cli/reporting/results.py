@@ -163,7 +163,7 @@ def summarise_cell(results: Results, cell: CellResult) -> CellSummary | None:
         area=None if area is None else summarise(area),
         normalised_area=None if scaled is None else summarise(scaled),
         gap=_gap(results, cell, values),
-        leader=None if cell.paper is None else leader(ours, (*cell.paper, NUM_SEEDS)),
+        leader=None if cell.paper is None or good.size < values.size else leader(ours, (*cell.paper, NUM_SEEDS)),
     )
 
 

@@ -111,8 +111,14 @@ class StudyFolder(RunSet):
         for cell, _ in again:
             cls(path, there)._refuse_old_rules(cell)
         wanted = {cell.name for cell in study.cells}
-        rest = tuple(cell for cell in there.cells if keep and cell.name not in wanted)
-        if wanted.union(cell.name for cell in rest) == known.keys() and all(new == old for new, old in again):
+        # one panel has one reference, else its table and its answer compare with two
+        firsts = {cell.panel: cell.name for cell in reversed(study.cells) if cell.reference is None}
+        rest = tuple(
+            cell.model_copy(update={"reference": firsts.get(cell.panel, cell.reference)})
+            for cell in there.cells
+            if keep and cell.name not in wanted
+        )
+        if {cell.name: cell for cell in (*study.cells, *rest)} == known:
             return cls(path, there), False
         commands = [*there.command.splitlines(), study.command] if rest else [study.command]
         merged: dict[str, object] = {"cells": study.cells + rest, "command": "\n".join(dict.fromkeys(commands))}

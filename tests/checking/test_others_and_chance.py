@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from esp_cli.checking import check_symmetry
+from esp_cli.checking.comparison import by_distances
 from esp_cli.checking.stepping import outcomes, visit
 from esp_cli.checking.verdicts import LATE, ElementVerdict, verdicts_of
 from esp_cli.symmetry import build_transform, parse_elements
@@ -223,3 +224,16 @@ def test_what_no_state_holds_is_judged_by_rows_only_where_nobody_else_is_there(c
     make_it = lambda num_envs, seeds: cls(cls.Settings(), num_envs, generators_for(seeds))  # noqa: E731
     (found,) = check_symmetry(make_it, "colour-1-0").elements
     assert (found.outcome, bool(found.reason)) == (outcome, outcome == "not covered")
+
+
+def test_chance_of_another_spread_is_broken_by_the_difference_of_deviations():
+    """Of +-1 the mean difference is 1, of +-2 it is 2; over the field's deviation, sqrt(5 / 2), times sqrt(pi) / 2."""
+    g = torch.Generator().manual_seed(0)
+    x, x2, y, y2 = (torch.randint(2, (4096, 1), generator=g) * 2.0 - 1 for _ in range(4))
+    found = by_distances("wind", x, x2, 2 * y, 2 * y2)
+    assert found.outcome == "broken"
+    assert found.gap == pytest.approx((math.pi / 4 / 2.5) ** 0.5, abs=0.03)
+    normal = [torch.randn(4096, 1, generator=g) for _ in range(4)]
+    assert by_distances("wind", *normal).outcome == "holds"
+    first, second, *others = normal
+    assert by_distances("wind", first, second, *(1.3 * other for other in others)).outcome == "broken"

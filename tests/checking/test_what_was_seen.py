@@ -61,6 +61,22 @@ class Point(BatchedTask):
         return self.states
 
 
+class LateWind(Point):  # a wind that nobody sees, of the second half of an episode
+    def _start(self, generator):
+        world = super()._start(generator)
+        return world | {"time": torch.zeros_like(world["position"][..., :1])}
+
+    def moved(self, world, action):
+        world["time"] = world["time"] + 1
+        return 0.1 * action + 0.1 * (world["time"] > 50) * torch.tensor([1.0, 0.0])
+
+
+def test_what_begins_late_in_an_episode_is_followed_there():
+    make = lambda count, seeds: LateWind(Settings(horizon=100), count, generators_for(seeds))  # noqa: E731
+    found = {element.element: element.outcome for element in check_symmetry(make, "rot90,flip-x").elements}
+    assert found == {"rot90": "broken", "flip-x": "holds"}
+
+
 class Delayed(Point):  # the action before this one moves, along x more
     hides = ("previous action",)
 

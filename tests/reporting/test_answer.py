@@ -48,6 +48,19 @@ def test_a_stopped_seed_leaves_no_verdict(tmp_path: Path) -> None:
     )
 
 
+def test_runs_with_a_stopped_seed_are_named_and_not_counted(tmp_path: Path) -> None:
+    folder = StudyFolder.create(tmp_path / "s", small_study("ablate-modules", algorithms=("mappo",)))
+    for cell, ends in zip(
+        folder.study.cells, ([-160.0] * 3, [-150.0] * 3, [-1.0, None, -1.0], [None] * 3), strict=True
+    ):
+        write_run(folder, cell, [[-200.0] * 3, [-150.0] * 3], ends)
+    first, _, last = answer(collect_study(folder))
+    assert first.startswith("Of 0 runs beside their reference") or first.startswith("Of 1 runs")
+    names = [cell.variant for cell in folder.study.cells]
+    panel = folder.study.cells[0].panel
+    assert last == f"Not compared, since a seed stopped: {names[2]}, {panel}; {names[3]}, {panel}."
+
+
 def test_the_steps_at_a_threshold_that_was_asked_for_are_told(tmp_path: Path) -> None:
     folder = StudyFolder.create(tmp_path / "s", small_study())
     for cell, end in zip(folder.study.cells, (-160.0, -120.0), strict=True):

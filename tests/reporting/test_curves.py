@@ -96,6 +96,17 @@ def test_runs_are_compared_where_all_were_evaluated():
         gathered([often, seldom], at=[70_000])
 
 
+def test_a_run_that_was_evaluated_more_often_is_not_there_sooner_for_that():
+    rising = [[-9.0 + k] for k in range(9)]
+    fine = curve(rising, "fine", tuple(range(0, 401, 50)), seeds=(0,))
+    coarse = curve(rising[::2], "coarse", tuple(range(0, 401, 100)), seeds=(0,))
+    found = compare([fine, coarse], [], [-6.0])
+    # the fine curve has -6 at 150, which the coarse one can show at 200 alone
+    assert [found[name][400]["steps_to"][0]["of_mean"] for name in found] == [200, 200]
+    assert [found[name][400]["evaluations"] for name in found] == [5, 5]
+    assert found["fine"][400]["area_under_curve"] == found["coarse"][400]["area_under_curve"]
+
+
 def test_each_run_says_how_many_episodes_are_behind_its_returns():
     few, many = curve(PLAIN, "plain"), curve(ESP, "ESP")
     evaluation = many.config.evaluation.model_copy(update={"episodes": 40})

@@ -35,6 +35,17 @@ def test_a_study_grows_by_cells_and_keeps_the_others(tmp_path):
     assert StudyFolder.open(tmp_path / "s").study == more
 
 
+def test_cells_that_stay_are_compared_with_the_reference_that_was_planned_last(tmp_path):
+    first = small_study("ablate-modules", algorithms=("mappo",))
+    none, loss = (cell for cell in first.cells if cell.variant in (first.cells[0].variant, "loss"))
+    changed = [none.model_copy(update={"reference": loss.name}), loss.model_copy(update={"reference": None})]
+    StudyFolder.create(tmp_path / "s", first)
+    study = first.model_copy(update={"cells": (changed[1], changed[0])})
+    merged = StudyFolder.create(tmp_path / "s", study).study
+    assert {cell.reference for cell in merged.cells} == {None, loss.name}
+    assert [cell.name for cell in merged.cells if cell.reference is None] == [loss.name]
+
+
 def test_a_study_that_keeps_no_others_holds_what_was_planned_last(tmp_path):
     StudyFolder.create(tmp_path / "s", small_study(command="esp a"))
     study = small_study(tasks=("predator-prey",), command="esp b")
