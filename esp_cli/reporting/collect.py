@@ -143,15 +143,15 @@ def collect_runs(
 
 
 def _apart(curve: RunCurve) -> float:
-    """Return how many steps lie between evaluations."""
-    return float(np.median(np.diff(curve.steps))) if len(curve.steps) > 1 else 0.0
+    """Return how many steps lie between evaluations, at most."""
+    return float(np.diff(curve.steps).max()) if len(curve.steps) > 1 else 0.0
 
 
 def _thinned(curve: RunCurve, at: Sequence[int], apart: float) -> RunCurve:
     """Return a curve without evaluations that others lack: who is looked at more often seems to be there sooner."""
     if _apart(curve) >= (1 - _LIKE) * apart:
         return curve
-    marks = np.r_[np.arange(0, curve.last_step + 1, apart), at]
+    marks = np.r_[np.arange(0, curve.last_step + 1, apart), at, curve.last_step]
     kept = np.unique(np.abs(curve.steps[:, None] - marks).argmin(0))
     return replace(curve, steps=curve.steps[kept], values=curve.values[kept])
 

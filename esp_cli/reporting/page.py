@@ -254,9 +254,8 @@ def _count(pairs: list[tuple[CellResult, CellResult]]) -> list[str]:
         return [_verdict(*pairs[0])]
     counts = f"better {sides['ahead']}, not told apart {sides['level']}, worse {sides['behind']}"
     counts += f", both below a policy that sees nothing {sides['blind']}" if sides["blind"] else ""
-    texts = [
-        f"Of {sides.total() - sides[None]} runs beside their reference: {counts} (95 % intervals of the difference)."
-    ]
+    number = sides.total() - sides[None]
+    texts = [f"Of {number} run{'s'[: number - 1]} beside their reference: {counts} (95 % intervals of the difference)."]
     if gaps:
         ordered = sorted(gaps, key=lambda pair: pair[1].difference.value)
         largest, smallest = (
