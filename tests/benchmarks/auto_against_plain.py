@@ -61,6 +61,7 @@ def trained(task: str, recipe: int, kind: str, steps: int, seeds: int) -> tuple[
     learner = build_learner(config)
     iterations = -(-steps // learner.steps_per_iteration)
     for number in range(iterations):
+        learner.begin(number / iterations)
         learner.iterate(number / iterations)
     worlds = build_environment(config, EPISODES, "evaluation")
     returns = play(worlds, PolicyController(learner.policy)).returns.mean(-1).tolist()
