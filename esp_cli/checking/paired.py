@@ -23,7 +23,7 @@ from esp_cli.checking.comparison import (
     state_by_state,
 )
 from esp_cli.checking.shifting import Shift
-from esp_cli.checking.stepping import nudged, outcomes, stretched, visit
+from esp_cli.checking.stepping import nudged, outcomes, seek_end, stretched, visit
 from esp_cli.checking.verdicts import ElementVerdict, FieldVerdict, Late, Watch, may_come, verdicts_of
 from esp_cli.symmetry import Element, Transform, build_transform
 from esp_envs.promises import MakeWorlds
@@ -82,6 +82,8 @@ class _Judge:
         if self._quick and (found := self._few.judge(element)).outcome == "broken":
             return found
         found = self._everywhere.judge(element)
+        if found.outcome == "not covered" and [f.field for f in found.fields if f.outcome != "holds"] == ["end"]:
+            found = self._as_at_an_end(element, found)
         if found.outcome == "holds" and self._further is not None:
             found = self._as_further_out(element, found)
         return self._as_later(element, found) if found.outcome == "holds" else found
@@ -97,6 +99,13 @@ class _Judge:
     @cached_property
     def _further(self) -> _Pairs | None:
         return self._tried([(stretched(state, self._spec.state), action) for state, action in self._some])
+
+    @cached_property
+    def _ending(self) -> _Pairs | None:
+        env, state = self._make(self._moments[0][0].shape[1], [0]), self._moments[0][0]
+        env.renews = False
+        found = seek_end(env, state, self._until)
+        return None if found is None else self._tried([found])
 
     @cached_property
     def _onwards(self) -> _Pairs | None:
@@ -116,6 +125,12 @@ class _Judge:
             raise
         except (Exception, SystemExit):
             return None
+
+    def _as_at_an_end(self, element: Element | Shift, found: ElementVerdict) -> ElementVerdict:
+        """Judge ends that did not come in play where one was found."""
+        near = None if self._ending is None else self._ending.judge(element)
+        ends = [f for f in near.fields if f.field == "end" and f.outcome == "holds"] if near else []
+        return replace(found, fields=tuple(ends[0] if f.field == "end" else f for f in found.fields)) if ends else found
 
     def _as_further_out(self, element: Element | Shift, found: ElementVerdict) -> ElementVerdict:
         assert self._further is not None

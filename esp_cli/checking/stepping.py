@@ -22,6 +22,7 @@ from esp_envs.spec import Continuous, Layout, TaskSpec
 from esp_envs.views import OthersAtRandom, RoleView
 
 MOMENTS = 8  # points of an episode at which states are taken
+_SOUGHT = 200  # steps at most until an end is found
 _NUDGE = 1e-6  # how far a state is moved to see what rounding does
 
 
@@ -121,9 +122,33 @@ def _joint_image(spec: TaskSpec, scene: Element) -> Callable[[Tensor], Tensor]:
     return lambda action: joined([one.action(action[own]) for one, own in maps])
 
 
-def stretched(state: Tensor, layout: Layout) -> Tensor:
-    """Return states [1, E, state width] whose vectors are up to ten times as long, the same factor for all of one."""
-    factor = 10 ** torch.rand(state.shape[1], 1, generator=torch.Generator().manual_seed(0)).to(state.device)
+def seek_end(env: Environment, state: Tensor, until: float) -> tuple[Tensor, Tensor] | None:
+    """Return states [1, E, state width] and actions, some of which end an episode as play did not; None if not found.
+
+    In half of the worlds all things gather first, as at a goal. Worlds act at random, and go on from the quarter of
+    them that was paid most so far.
+    """
+    half = env.num_envs // 2
+    state = torch.cat([stretched(state[:, :half], env.spec.state, decades=-3.0), state[:, half:]], 1)
+    paid, count = torch.zeros(env.num_envs, device=state.device), max(1, env.num_envs // 4)
+    for _ in range(_SOUGHT):
+        stop_at(until)
+        env.reset()
+        env.set_state(state)
+        action = env.random_action()
+        step = env.step(action)
+        if bool(step.terminated.any()):
+            return state, action
+        paid = paid + step.reward.flatten(0, 1).flatten(1).mean(-1).nan_to_num(-torch.inf)
+        best = paid.topk(count).indices.repeat(-(-env.num_envs // count))[: env.num_envs]
+        state, paid = step.reached.state[:, best], paid[best]
+    return None
+
+
+def stretched(state: Tensor, layout: Layout, decades: float = 1.0) -> Tensor:
+    """Return states [1, E, state width] whose vectors are up to 10**decades times as long, all of one alike."""
+    share = torch.rand(state.shape[1], 1, generator=torch.Generator().manual_seed(0)).to(state.device)
+    factor = 10 ** (decades * share)
     out = state.clone()
     for field, where in zip(layout.fields, layout.slices().values(), strict=True):
         if field.kind.is_vector and not bool((state[..., where] == state[..., where].round()).all()):  # no cells

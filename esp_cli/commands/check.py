@@ -69,7 +69,7 @@ def check(
 
     Symmetry is tested per element and field: it holds, is broken, or is not covered (no data could have shown a
     breaking). Of a mirror each number is compared with what the model proves. Exit code 0: all that is promised or
-    declared holds; 1: something is broken; 2: something is not covered.
+    declared holds; 1: something is broken; 2: something is not covered. A policy's distance is measured, not judged.
     """
     if what in ("mirror", "policy"):
         if any((settings, transforms, policy, algo, network)):

@@ -195,3 +195,29 @@ class Far(End):  # where few episodes end, each in a step of its own
 
 def test_states_from_which_episodes_ended_are_visited():
     assert verdict(Far, "rot90") == ("broken", {"end"})
+
+
+class Goal(NoEnd):  # where play comes by once in a thousand episodes
+    speed = 0.0005
+
+    def _ended(self, world):
+        return world["position"][:, :, 0].norm(dim=-1) < 0.004
+
+
+class Half(Goal):
+    def _ended(self, world):
+        return super()._ended(world) & (world["position"][:, :, 0, 0] > 0)
+
+
+class Way(NoEnd):  # where the pay leads, and nothing that gathers
+    def paid(self, place):
+        return place[..., 0]
+
+    def _ended(self, world):
+        return world["position"][:, :, 0, 0] > 6
+
+
+def test_ends_that_play_does_not_reach_are_sought_where_things_gather_and_where_the_pay_leads():
+    assert verdict(Goal, "rot90")[0] == "holds"
+    assert verdict(Half, "rot90") == ("not covered", {"end"})
+    assert verdict(Way, "flip-x")[0] == "holds"

@@ -34,6 +34,13 @@ def simulator(scenario: Any, num_envs: int, device: torch.device, arguments: Map
         raise UserError(f"VMAS does not make '{scenario}' with {dict(arguments)}: {last_line(error)}") from error
 
 
+def has_end(sim: Any) -> bool:
+    """Whether a scenario says when an episode is over: whether its `done` is one of its own."""
+    from vmas.simulator.scenario import BaseScenario  # noqa: PLC0415 - an extra
+
+    return type(sim.scenario).done is not BaseScenario.done
+
+
 def rows(given: Sequence[Any], what: str, num_envs: int, width: int | None = None) -> Tensor:
     """Return what a scenario gives each agent as [E, N, width]."""
     for k, one in enumerate(given):

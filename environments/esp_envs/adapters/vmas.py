@@ -58,7 +58,7 @@ class VmasTask(Environment):
     flags: tuple[str, ...] = ()
     """Attributes of landmarks, 0 or 1 for each world, that belong to the state."""
     terminates: bool = False
-    """Whether the scenario's `done` ends an episode; without it, `done` is a metric."""
+    """Whether the scenario's `done`, if it has one, ends an episode; without it, `done` is a metric."""
     shared_reward: bool | Mapping[str, bool] = False
     """Whether all agents, or those of a role, get the same reward."""
     metrics: tuple[str, ...] = ()
@@ -88,6 +88,7 @@ class VmasTask(Environment):
         require_attributes(self, "scenario", "symmetry", "convention")
         made = self.scenario, num_envs, self.device, self.arguments()
         self._sims = [simulation.simulator(*made) for _ in self.generators]
+        self.terminates = self.terminates and simulation.has_end(self._sims[0])
         self._numbers = [simulation.RandomNumbers(generator.initial_seed()) for generator in self.generators]
         given = self.seen()
         seen = given if isinstance(given, Mapping) else {"": given}
