@@ -184,7 +184,7 @@ def _print(body: Body, model: Path) -> None:
                 f"  no sensor is the image of {_some(lost)}; in brackets, how far off, as a share of its spread"
             )
         if one.proof.unlike:
-            console.say(f"  not as that of its image, where no state need show it: {_some(one.proof.unlike)}")
+            console.say(f"  differs from its image, though accelerations do not show it: {_some(one.proof.unlike)}")
         if one.proof.unjudged:
             console.say(f"  not judged: sensors of the kinds {', '.join(one.proof.unjudged)}")
         if unseen := [joint for joint, _, _, _, planted, _ in body.rows(name) if not one.proof.would_show(planted)]:
