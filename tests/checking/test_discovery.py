@@ -136,7 +136,7 @@ def test_a_policy_that_prefers_a_direction_accuses_no_symmetric_task() -> None:
         ("d4,marks-1-0-2,agents-0-2-1", "d4 and agents-0-2-1,marks-1-0-2", "d4,agents-0-2-1,marks-1-0-2"),
         ("d16,rot57,flip23,marks-1-0-2", "o2 and marks-1-0-2", "o2"),
         ("marks-1-0-2,marks-0-2-1", "c1*marks-3", "marks-3"),
-        ("agents-1-0-2,agents-2-1-0", "c1*agents", "agents"),
+        ("agents-1-0-2,agents-2-1-0", "c1 and agents-1-0-2,agents-2-1-0", "agents-1-0-2,agents-2-1-0"),
         (
             "rot180,flip45,flip135,agents-1-0-2,agents-0-2-1,agents-2-1-0",
             "rot180,flip-diagonal,flip-antidiagonal and agents",
