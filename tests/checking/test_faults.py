@@ -137,7 +137,8 @@ def test_there_are_fifty_clean_cases() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("task", "settings"), CLEAN, ids=str)
-def test_a_clean_task_is_not_accused(task: str, settings) -> None:
+def test_a_clean_task_is_not_accused(task: str, settings, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()  # with fewer worlds a picture of chance is not covered
     elements = elements_of(task, settings).replace("rot90", "rot180" if settings.get("width") == 7 else "rot90")
     report = check_symmetry(lambda n, seeds: make(task, n, seeds, settings), elements)
     assert report.holds
