@@ -124,7 +124,7 @@ def report(failure: Exception | SystemExit) -> int | None:
     if isinstance(failure, OSError) and failure.errno is not None:
         console.error(formatting.sentence(failure))
         return EXIT_USER if formatting.is_correctable(failure) else EXIT_MACHINE
-    if isinstance(failure, MemoryError) or _LACK_OF_MEMORY.search(str(failure)):
+    if isinstance(failure, MemoryError) or (isinstance(failure, RuntimeError) and _LACK_OF_MEMORY.search(str(failure))):
         console.error("this needs more memory than there is; choose fewer agents, worlds, episodes or seeds")
         return EXIT_MACHINE
     installed = sys.modules.get("esp_envs.installed")  # not imported: then no code of the user ran

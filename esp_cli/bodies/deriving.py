@@ -25,7 +25,7 @@ from esp_envs.errors import UserError
 LOOSE = 0.1  # how far a matched joint's line may be off, as a share of the robot's size, or of its axis' length
 FAR = 0.25  # how far a body's middle of mass may be off, as a share of the robot's size, to be matched
 _APART = 1e6
-_UNLIKE = 0.02
+_UNLIKE = 0.02  # gap of servos of position and of velocity, which are matched where there is no better
 
 
 @dataclass(frozen=True)

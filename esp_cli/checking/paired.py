@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, cached_property, partial
@@ -35,8 +35,8 @@ _SOME = 8  # of more elements than these, each is first tried in one of so many 
 _FURTHER = "holds where play went, but further out {} would differ"
 _HIDDEN = "the state leaves out {}, and later steps do not tell what that does"
 _LATER, _LATER_OF_SLOW = 128, 32
-"""Steps of an episode that are followed from its start, for what builds up that no state holds; of slow simulators
-fewer."""
+"""Steps that are followed from an episode's start, for what builds up that no state holds, or until an end is found;
+of slow simulators fewer."""
 _HERE, _THERE = (101, 102), (103, 104)  # seeds of two runs from the states, two from images, with own chance
 Visited = tuple[Tensor, Tensor]  # states [1, E, state width] and joint actions
 
@@ -98,14 +98,20 @@ class _Judge:
 
     @cached_property
     def _further(self) -> _Pairs | None:
-        return self._tried([(stretched(state, self._spec.state), action) for state, action in self._some])
+        further = [(stretched(state, self._spec.state), action) for state, action in self._some]
+        return self._tried(lambda: _Pairs(self._make, further, self._until))
 
     @cached_property
     def _ending(self) -> _Pairs | None:
-        env, state = self._make(self._moments[0][0].shape[1], [0]), self._moments[0][0]
-        env.renews = False
-        found = seek_end(env, state, self._until)
-        return None if found is None else self._tried([found])
+        state = self._moments[0][0]
+
+        def sought() -> _Pairs | None:
+            env = self._make(state.shape[1], [0])
+            env.renews = False
+            found = seek_end(env, state, _LATER_OF_SLOW if self._slow else _LATER, self._until)
+            return None if found is None else _Pairs(self._make, [found], self._until)
+
+        return self._tried(sought)
 
     @cached_property
     def _onwards(self) -> _Pairs | None:
@@ -115,12 +121,13 @@ class _Judge:
         actions = [action[:, ::_SOME] for _, action in self._moments]
         count = min(_LATER_OF_SLOW if self._slow else _LATER, spec.horizon)
         start = self._moments[0][0][:, ::_SOME]
-        return self._tried([(start, actions[k % len(actions)]) for k in range(count)], onwards=True)
+        episode = [(start, actions[k % len(actions)]) for k in range(count)]
+        return self._tried(lambda: _Pairs(self._make, episode, self._until, onwards=True))
 
-    def _tried(self, visited: Sequence[Visited], onwards: bool = False) -> _Pairs | None:
+    def _tried(self, pairs: Callable[[], _Pairs | None]) -> _Pairs | None:
         """Return pairs from states, or None where these, or what is done in them, are not for this task."""
         try:
-            return _Pairs(self._make, visited, self._until, onwards)
+            return pairs()
         except Late:
             raise
         except (Exception, SystemExit):

@@ -22,7 +22,6 @@ from esp_envs.spec import Continuous, Layout, TaskSpec
 from esp_envs.views import OthersAtRandom, RoleView
 
 MOMENTS = 8  # points of an episode at which states are taken
-_SOUGHT = 200  # steps at most until an end is found
 _NUDGE = 1e-6  # how far a state is moved to see what rounding does
 
 
@@ -122,7 +121,7 @@ def _joint_image(spec: TaskSpec, scene: Element) -> Callable[[Tensor], Tensor]:
     return lambda action: joined([one.action(action[own]) for one, own in maps])
 
 
-def seek_end(env: Environment, state: Tensor, until: float) -> tuple[Tensor, Tensor] | None:
+def seek_end(env: Environment, state: Tensor, steps: int, until: float) -> tuple[Tensor, Tensor] | None:
     """Return states [1, E, state width] and actions, some of which end an episode as play did not; None if not found.
 
     In half of the worlds all things gather first, as at a goal. Worlds act at random, and go on from the quarter of
@@ -131,7 +130,7 @@ def seek_end(env: Environment, state: Tensor, until: float) -> tuple[Tensor, Ten
     half = env.num_envs // 2
     state = torch.cat([stretched(state[:, :half], env.spec.state, decades=-3.0), state[:, half:]], 1)
     paid, count = torch.zeros(env.num_envs, device=state.device), max(1, env.num_envs // 4)
-    for _ in range(_SOUGHT):
+    for _ in range(steps):
         stop_at(until)
         env.reset()
         env.set_state(state)

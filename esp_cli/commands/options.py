@@ -144,7 +144,7 @@ def not_over_a_run(context: typer.Context, path: T) -> T:
     real = Path(os.path.realpath(str(path)))  # a link is followed when it is written
     if real.is_dir():  # known before hours of work
         raise UserError(f"{path} is a folder; name a file in it")
-    refuse_unwritable(real)
+    refuse_unwritable(str(path))
     documents = (of.CONFIG, of.STUDY, of.TUNING)
     names = (*documents, of.METRICS, of.POLICY, of.INITIAL, of.LOCK, of.JOURNAL, of.STUDY_LOCK)
     owned = real.is_file() and real.name in (names if context.info_name == "eval" else (*names, of.FINAL))

@@ -103,9 +103,8 @@ def spaces(spec: TaskSpec, program: Program) -> list[str]:
             f"The policy takes the {program.num_inputs} own numbers as its observation, and beside them a table "
             f"of each set, with a row for each thing, as many as there are, at least one; numbers of a row: {names}."
         )
-    if not any(
-        hasattr(field.kind, "parts") for field in spec.observation.fields
-    ):  # a robot's numbers may be seen from its body
+    of_robot = any(hasattr(field.kind, "parts") for field in spec.observation.fields)
+    if not of_robot:  # whose numbers may be seen from its body
         lines += ["The frame is the world's: x to the right, y up, angles counter-clockwise in radians."]
     lines.append("Action of one agent:")
     if isinstance(spec.action, Discrete):

@@ -44,9 +44,10 @@ def write_file(path: str | os.PathLike[str], content: bytes) -> None:
 
 def refuse_unwritable(path: str | os.PathLike[str]) -> None:
     """Refuse a path that `write_file` could not write, as known before the work whose result is to stand there."""
-    path = Path(os.path.realpath(path))
-    special = path.exists() and not path.is_file()
-    place = path if special else next(folder for folder in path.parents if folder.exists())
+    path = Path(path)
+    special = path.exists() and not path.is_file()  # a pipe behind a link has no real path
+    real = Path(os.path.realpath(path))
+    place = path if special else next(folder for folder in real.parents if folder.exists())
     wrong = errno.EACCES if not os.access(place, os.W_OK) else 0 if special or place.is_dir() else errno.ENOTDIR
     if path.is_dir():
         wrong = errno.EISDIR
