@@ -34,7 +34,12 @@ def gym(name: str, *seen: Field, torques: int = 0, **attributes: Any) -> type[Si
         return gymnasium.make(name)
 
     action = attributes.pop("action", None) or Continuous(layout(Field("torque", P, torques)))
-    members: dict[str, Any] = {"observation": Layout(seen), "action": action, "symmetry": "c1", "terminates": True}
+    members: dict[str, Any] = {
+        "observation": Layout(seen),
+        "action": action,
+        "symmetry": "c1",
+        "terminates": name != "Reacher-v5",
+    }
     members |= {"make_single": make_single, "convention": name}
     return type(name.title().replace("-", ""), (SingleAgentTask,), members | attributes)
 
