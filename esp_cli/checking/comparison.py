@@ -130,7 +130,9 @@ def _each_state(name: str, apart: Tensor, rounding: Tensor, scale: float, units:
     unlike = (apart > NEGLIGIBLE * scale).any(1)
     differ = ((apart > NEGLIGIBLE * units) & (apart > rounding.unsqueeze(1))).any(1)
     share, unclear = float(differ.float().mean()), float((unlike & ~differ).float().mean())
-    gap = float(((apart / units).amax(1) * differ).mean())
+    # in small units a gap counts up to 1, so that what is told stays one in deviations of the field
+    sizes = torch.minimum(apart / units, (apart / scale).clamp_min(1.0))
+    gap = float((sizes.amax(1) * differ).mean())
     return concluded(name, gap, 0.0, bool(differ.any()), float(unclear > _UNCLEAR), share)
 
 

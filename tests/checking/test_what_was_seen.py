@@ -221,3 +221,10 @@ def test_ends_that_play_does_not_reach_are_sought_where_things_gather_and_where_
     assert verdict(Goal, "rot90")[0] == "holds"
     assert verdict(Half, "rot90") == ("not covered", {"end"})
     assert verdict(Way, "flip-x")[0] == "holds"
+
+
+def test_a_gap_is_told_in_deviations_of_the_field_or_of_a_small_number_up_to_one():
+    for task, most in ((Slow, 1.0), (Point, 0.0)):
+        (found,) = check_symmetry(lambda n, seeds, t=task: t(Settings(), n, generators_for(seeds)), "rot90").elements
+        assert (found.worst.gap > 0) == (task is Slow)
+        assert found.worst.gap <= most
