@@ -111,8 +111,9 @@ class StudyFolder(RunSet):
         for cell, _ in again:
             cls(path, there)._refuse_old_rules(cell)
         wanted = {cell.name for cell in study.cells}
-        # one panel has one reference, else its table and its answer compare with two
-        firsts = {cell.panel: cell.name for cell in reversed(study.cells) if cell.reference is None}
+        # a panel of variants has one reference, else its table and its answer compare with two
+        alike = study.cells if study.rows == "variants" else ()
+        firsts = {cell.panel: cell.name for cell in reversed(alike) if cell.reference is None}
         rest = tuple(
             cell.model_copy(update={"reference": firsts.get(cell.panel, cell.reference)})
             for cell in there.cells

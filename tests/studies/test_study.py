@@ -46,6 +46,13 @@ def test_cells_that_stay_are_compared_with_the_reference_that_was_planned_last(t
     assert [cell.name for cell in merged.cells if cell.reference is None] == [loss.name]
 
 
+def test_another_learner_in_a_panel_keeps_a_reference_of_its_own(tmp_path):
+    first = StudyFolder.create(tmp_path / "s", small_study(algorithms=("mappo",), command="esp a")).study
+    more = StudyFolder.create(tmp_path / "s", small_study(algorithms=("maddpg",), command="esp b")).study
+    assert more.cells[2:] == first.cells
+    assert [cell.reference for cell in more.cells] == [None, more.cells[0].name, None, first.cells[0].name]
+
+
 def test_a_study_that_keeps_no_others_holds_what_was_planned_last(tmp_path):
     StudyFolder.create(tmp_path / "s", small_study(command="esp a"))
     study = small_study(tasks=("predator-prey",), command="esp b")
