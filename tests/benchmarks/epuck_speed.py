@@ -23,7 +23,7 @@ import torch
 from env_speed import figures, show
 
 from esp_envs import make
-from esp_envs.epuck.engines import ENGINES, make_physics
+from esp_envs.epuck.physics import ENGINES, make_physics
 from esp_envs.epuck.robot import MAX_WHEEL_SPEED, Arena
 
 ARENA = Arena(side_m=2.0, num_robots=8, num_pillars=2, pillar_radius_m=0.1)
@@ -33,6 +33,7 @@ EPISODE = 300
 
 def of_physics(engine: str, worlds: int, threads: int) -> Callable[[], object]:
     """Return what takes one step of all worlds of an engine."""
+    torch.set_num_threads(threads)
     rng = np.random.default_rng(0)
     robots = (worlds, ARENA.num_robots)
     wheels = MAX_WHEEL_SPEED * rng.uniform(-1, 1, (EPISODE, *robots, 2))
@@ -44,7 +45,7 @@ def of_physics(engine: str, worlds: int, threads: int) -> Callable[[], object]:
         "mass": np.ones(robots),
         "friction": np.ones(robots),
     }
-    physics = make_physics(engine, ARENA, worlds, PERIOD_S, threads)
+    physics = make_physics(engine, ARENA, worlds, PERIOD_S)
     steps = itertools.cycle(range(EPISODE))
 
     def step() -> None:

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from esp_envs.batched import BatchedTask, Outcome, World
 from esp_envs.epuck import formation_rules as rules
-from esp_envs.epuck.engines import make_physics
 from esp_envs.epuck.formation_spec import WHEEL_PAIRS, FormationSettings, formation_spec, nearest_pair
 from esp_envs.epuck.gl import open_painter
+from esp_envs.epuck.physics import make_physics
 from esp_envs.epuck.robot import BODY_RADIUS_M, DIMENSIONS, MAX_WHEEL_SPEED, Array
 from esp_envs.scene import Painter, Scene
 from esp_envs.settings import TaskSettings
@@ -85,9 +85,7 @@ class Formation(BatchedTask):
         super().__init__(settings, num_envs, generators)
         self.arena = settings.arena
         self.num_worlds = self.num_seeds * num_envs
-        self.physics = make_physics(
-            settings.physics, self.arena, self.num_worlds, settings.control_period_s, torch.get_num_threads()
-        )
+        self.physics = make_physics(settings.physics, self.arena, self.num_worlds, settings.control_period_s)
         robots = (self.num_worlds, settings.num_agents)
         self._posts = np.broadcast_to(self.arena.posts(), (*robots, 2))
         self._pairs = np.array(WHEEL_PAIRS.points)

@@ -12,6 +12,7 @@ from abc import abstractmethod
 
 import mujoco
 import numpy as np
+import torch
 from mujoco.batch import Batch
 
 from esp_envs.epuck.physics import TIMESTEP_S, Physics
@@ -33,14 +34,14 @@ mujoco.set_mju_user_warning(lambda _: None)  # by default warnings go to a file 
 
 
 class MujocoWorlds(Physics):
-    """W worlds of a MuJoCo model in one `mujoco.batch.Batch`, stepped by its threads."""
+    """W worlds of a MuJoCo model in one `mujoco.batch.Batch`, stepped by as many threads as PyTorch uses."""
 
     remembered = ("qpos", "qvel", "pillars", "warmstart", "mass", "friction")
 
-    def __init__(self, arena: Arena, num_worlds: int, control_period_s: float, num_threads: int) -> None:
-        super().__init__(arena, num_worlds, control_period_s, num_threads)
+    def __init__(self, arena: Arena, num_worlds: int, control_period_s: float) -> None:
+        super().__init__(arena, num_worlds, control_period_s)
         self.model = self._model(arena)
-        self._batch = Batch(self.model, nsim=num_worlds, nthread=num_threads)
+        self._batch = Batch(self.model, nsim=num_worlds, nthread=torch.get_num_threads())
         shape = (num_worlds, arena.num_robots)
         self._qpos = self._batch.bind("qpos").reshape(*shape, -1)
         self._qvel = self._batch.bind("qvel").reshape(*shape, -1)

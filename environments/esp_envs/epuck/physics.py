@@ -1,4 +1,7 @@
-"""The contract of physics engines: robots are placed, driven by wheel speeds, and read back."""
+"""The physics engines: robots are placed, driven by wheel speeds, and read back.
+
+Adding one is one module and one line in `ENGINES`; it is imported when it is used.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +10,16 @@ from typing import ClassVar
 
 import numpy as np
 
+from esp_envs.epuck.gl import forget_missing_backend
 from esp_envs.epuck.robot import Arena, Array
 from esp_envs.errors import UserError
+from esp_envs.installed import load
 
+ENGINES = {
+    "mujoco": "esp_envs.epuck.mujoco_engines:MujocoPlanar",
+    "mujoco-3d": "esp_envs.epuck.mujoco_engines:MujocoSpatial",
+    "pymunk": "esp_envs.epuck.pymunk_engine:PymunkPlanar",
+}
 TIMESTEP_S = 0.01
 
 
@@ -20,7 +30,7 @@ class Physics(ABC):
     _pose: Array
     _velocity: Array
 
-    def __init__(self, arena: Arena, num_worlds: int, control_period_s: float, num_threads: int) -> None:
+    def __init__(self, arena: Arena, num_worlds: int, control_period_s: float) -> None:
         self.arena, self.num_worlds, self.control_period_s = arena, num_worlds, control_period_s
         self._substeps = round(control_period_s / TIMESTEP_S)
         if self._substeps < 1 or not np.isclose(self._substeps * TIMESTEP_S, control_period_s, rtol=1e-9):
@@ -57,3 +67,14 @@ class Physics(ABC):
     @abstractmethod
     def load_state_dict(self, arrays: dict[str, Array]) -> None:
         """Restore what `state_dict` of an engine of the same size returned."""
+
+
+def make_physics(name: str, arena: Arena, num_worlds: int, control_period_s: float) -> Physics:
+    """Make W worlds in the engine `name`; refuse one whose library is missing."""
+    forget_missing_backend()
+    try:
+        engine: type[Physics] = load(ENGINES[name])
+    except ImportError as error:
+        package = (error.name or name.partition("-")[0]).partition(".")[0]
+        raise UserError(f"the physics '{name}' needs the package {package}; pip install --upgrade {package}") from None
+    return engine(arena, num_worlds, control_period_s)

@@ -39,8 +39,8 @@ class PymunkPlanar(Physics):
 
     remembered = ("pose", "velocity", "pillars", "mass", "friction")
 
-    def __init__(self, arena: Arena, num_worlds: int, control_period_s: float, num_threads: int) -> None:
-        super().__init__(arena, num_worlds, control_period_s, num_threads)
+    def __init__(self, arena: Arena, num_worlds: int, control_period_s: float) -> None:
+        super().__init__(arena, num_worlds, control_period_s)
         self._robots: list[list[pymunk.Body]] = []
         self._spaces = [self._space() for _ in range(num_worlds)]
         # The space's own static body, which bears the walls, comes last in all that is read and written.

@@ -1,10 +1,12 @@
 """A world's future depends on its state alone: not on its past, its neighbours, or the number of threads."""
 
+from functools import partial
+
 import numpy as np
 import pytest
+import torch
 
-from esp_envs.epuck.engines import ENGINES, make_physics
-from esp_envs.epuck.physics import Physics
+from esp_envs.epuck.physics import ENGINES, Physics, make_physics
 from esp_envs.epuck.robot import Arena, Array
 from tests.envs.epuck.driving import PERIOD_S, at_posts, at_random, bodies, engine, gap_between_robots, to_the_middle
 
@@ -76,12 +78,13 @@ def test_a_world_is_the_same_alone_and_among_others(name: str) -> None:
 
 
 @every_engine
-def test_the_number_of_threads_changes_nothing(name: str) -> None:
+def test_the_number_of_threads_changes_nothing(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(4)
     start = bodies(ARENA, at_posts(ARENA, WORLDS, rng))
     records = []
     for threads in (1, 2):
-        physics = make_physics(name, ARENA, WORLDS, PERIOD_S, threads)
+        monkeypatch.setattr(torch, "get_num_threads", partial(int, threads))
+        physics = make_physics(name, ARENA, WORLDS, PERIOD_S)
         physics.place(**start)
         records.append(heap(physics, 40))
     np.testing.assert_array_equal(*records)
