@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cached_property
+from itertools import accumulate, pairwise
 from typing import ClassVar, NamedTuple
 
 from esp_envs.errors import UserError
@@ -217,11 +218,8 @@ class Layout:
 
     def slices(self) -> dict[str, slice]:
         """Where each field lies in a row."""
-        out, start = {}, 0
-        for f in self.fields:
-            out[f.name] = slice(start, start + f.width)
-            start += f.width
-        return out
+        stops = accumulate((f.width for f in self.fields), initial=0)
+        return {f.name: slice(*ends) for f, ends in zip(self.fields, pairwise(stops), strict=True)}
 
     @property
     def own(self) -> tuple[Placed, ...]:
@@ -267,11 +265,8 @@ class Layout:
 
     def table(self) -> list[tuple[str, str, str, str]]:
         """Rows (index range, name, kind x count, unit) for environment cards and export manifests."""
-        rows = []
-        for f, s in self._placed:
-            span = str(s.start) if f.width == 1 else f"{s.start}..{s.stop - 1}"
-            rows.append((span, f.name, f.described, f.unit))
-        return rows
+        spans = (str(s.start) if f.width == 1 else f"{s.start}..{s.stop - 1}" for f, s in self._placed)
+        return [(span, f.name, f.described, f.unit) for span, f in zip(spans, self.fields, strict=True)]
 
 
 def layout(*fields: Field) -> Layout:

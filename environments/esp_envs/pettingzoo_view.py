@@ -55,7 +55,7 @@ class ParallelView(ParallelEnv):  # type: ignore[misc]  # pettingzoo may be miss
         if render_mode not in (None, "rgb_array"):
             raise UserError(f"unknown render mode '{render_mode}'; use 'rgb_array' or none")
         self._env = make(task_name, 1, [seed], settings)
-        spec = self._env.spec
+        spec, action = self._env.spec, self._env.spec.action
         self.metadata: dict[str, Any] = {
             "name": f"{spec.name}_v{spec.version}",
             "render_modes": ["rgb_array"],
@@ -68,14 +68,15 @@ class ParallelView(ParallelEnv):  # type: ignore[misc]  # pettingzoo may be miss
         self.state_space = spaces.Box(-np.inf, np.inf, (spec.state.width,), np.float32)
         self._state = np.zeros(spec.state.width, np.float32)
         # one space object per agent: each has its own random generator
-        self.observation_spaces: dict[str, spaces.Space[Any]] = {}
-        self.action_spaces: dict[str, spaces.Space[Any]] = {}
-        for agent in self.possible_agents:
-            self.observation_spaces[agent] = spaces.Box(-np.inf, np.inf, (spec.observation.width,), np.float32)
-            if isinstance(spec.action, Continuous):
-                self.action_spaces[agent] = spaces.Box(-1.0, 1.0, (spec.action.width,), np.float32)
-            else:
-                self.action_spaces[agent] = spaces.Discrete(spec.action.count)
+        self.observation_spaces = {
+            agent: spaces.Box(-np.inf, np.inf, (spec.observation.width,), np.float32) for agent in self.possible_agents
+        }
+        self.action_spaces = {
+            agent: spaces.Box(-1.0, 1.0, (action.width,), np.float32)
+            if isinstance(action, Continuous)
+            else spaces.Discrete(action.count)
+            for agent in self.possible_agents
+        }
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
         """Return the observation space of an agent, always the same object."""
@@ -92,7 +93,8 @@ class ParallelView(ParallelEnv):  # type: ignore[misc]  # pettingzoo may be miss
         if seed is not None:
             self._env.generators[0].manual_seed(int(seed))
         seen = self._env.reset()
-        self.agents = self._living(seen, self.possible_agents)
+        self.agents = self.possible_agents
+        self.agents = self._living(seen)
         return self._take(seen, {})
 
     def step(
@@ -102,21 +104,16 @@ class ParallelView(ParallelEnv):  # type: ignore[misc]  # pettingzoo may be miss
         if not self.agents:
             return {}, {}, {}, {}, {}
         step = self._env.step(self._joint(actions))
-        terminated, truncated = bool(step.terminated[0, 0]), bool(step.truncated[0, 0])
+        terminated, truncated = bool(step.terminated), bool(step.truncated)
         if (terminated or truncated) and self.render_mode is not None and self._env.has("set_state"):
             put_back(self._env, step.reached)  # the world has reset itself; show how the episode ended
-        seen, agents = step.reached, self.agents
-        living = self._living(seen, agents)
-        reward = dict(zip(self.possible_agents, step.reward[0, 0].tolist(), strict=True))
-        observation, infos = self._take(seen, {name: float(value[0, 0]) for name, value in step.metrics.items()})
+        living = self._living(step.reached)
+        observation, infos = self._take(step.reached, {name: float(value) for name, value in step.metrics.items()})
+        rewards = {agent: float(reward) for agent, reward in self._by_agent(step.reward).items()}
+        terminations = {agent: terminated or agent not in living for agent in self.agents}
+        truncations = {agent: truncated and agent in living for agent in self.agents}
         self.agents = [] if terminated or truncated else living
-        return (
-            observation,
-            {agent: reward[agent] for agent in agents},
-            {agent: terminated or agent not in living for agent in agents},
-            {agent: truncated and agent in living for agent in agents},
-            infos,
-        )
+        return observation, rewards, terminations, truncations, infos
 
     def state(self) -> _Array:
         """Return the global state [state width]."""
@@ -157,12 +154,11 @@ class ParallelView(ParallelEnv):  # type: ignore[misc]  # pettingzoo may be miss
         infos = {agent: metrics | ({"action_mask": masks[agent]} if masks else {}) for agent in self.agents}
         return self._by_agent(seen.obs), infos
 
-    def _by_agent(self, x: torch.Tensor) -> dict[str, _Array]:
-        rows = dict(zip(self.possible_agents, x[0, 0].numpy(), strict=True))
-        return {agent: rows[agent].copy() for agent in self.agents}
+    def _by_agent(self, x: torch.Tensor) -> dict[str, Any]:
+        """Return what [1, 1, N, ...] says of each agent that still acts, as memory of its own."""
+        rows = dict(zip(self.possible_agents, x[0, 0].numpy().copy(), strict=True))
+        return {agent: rows[agent] for agent in self.agents}
 
-    def _living(self, observation: Observation, agents: list[str]) -> list[str]:
-        if observation.alive is None:
-            return list(agents)
-        alive = dict(zip(self.possible_agents, observation.alive[0, 0].tolist(), strict=True))
-        return [agent for agent in agents if alive[agent]]
+    def _living(self, seen: Observation) -> list[str]:
+        """Return which of the agents that acted still do."""
+        return [*self.agents] if seen.alive is None else [k for k, alive in self._by_agent(seen.alive).items() if alive]

@@ -52,36 +52,6 @@ class WildlifeSettings(TaskSettings):
         return self
 
 
-def wildlife_spec(settings: WildlifeSettings) -> TaskSpec:
-    """Return the spec that follows from the settings."""
-    agents, width, height = settings.num_agents, settings.width, settings.height
-    before = "before its move, no way round the torus" if settings.convention == "esp" else "after its move"
-    whole = "d4*agents" if width == height else "d2*agents"
-    return TaskSpec(
-        name="wildlife",
-        version=1,
-        convention=f"{settings.convention}: 1 a drone at the trap, -{STEP_COST:g} a step; poacher's cell {before}"
-        + settings.broken_in_words(),
-        num_agents=agents,
-        horizon=settings.horizon,
-        observation=layout(
-            Field("picture", Kind.PICTURE, 1, "shade", pixels=(PIXELS * height, PIXELS * width)),
-            Field("others", Kind.VECTOR, agents - 1, "cell", Items.OTHERS),
-        ),
-        state=layout(
-            Field("drones", Kind.VECTOR, agents, "cell", Items.AGENTS, is_point=True),
-            Field("poacher", Kind.VECTOR, 1, "cell", is_point=True),
-        ),
-        action=MOVES,
-        symmetry=settings.left_of(whole),
-        nearly=whole,
-        control_period_s=0.25,
-        totals=("captures", "lone_landings", "collisions", "steps"),
-        terminates=True,
-        settings=settings.model_dump(),
-    )
-
-
 _DRONE = ((0.0, 1.0, 0.0), (1.0, 1.0, 1.0), (0.0, 1.0, 0.0))
 _POACHER = ((1.0, 0.0, 1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 1.0))  # plus and cross: the same in all images of the square
 
@@ -159,7 +129,33 @@ class Wildlife(BatchedTask):
         self._put(torch.zeros(self.state_shape, device=device))
 
     def _describe(self) -> TaskSpec:
-        return wildlife_spec(self.settings)
+        settings = self.settings
+        agents, width, height = settings.num_agents, settings.width, settings.height
+        before = "before its move, no way round the torus" if settings.convention == "esp" else "after its move"
+        whole = "d4*agents" if width == height else "d2*agents"
+        return TaskSpec(
+            name="wildlife",
+            version=1,
+            convention=f"{settings.convention}: 1 a drone at the trap, -{STEP_COST:g} a step; poacher's cell {before}"
+            + settings.broken_in_words(),
+            num_agents=agents,
+            horizon=settings.horizon,
+            observation=layout(
+                Field("picture", Kind.PICTURE, 1, "shade", pixels=(PIXELS * height, PIXELS * width)),
+                Field("others", Kind.VECTOR, agents - 1, "cell", Items.OTHERS),
+            ),
+            state=layout(
+                Field("drones", Kind.VECTOR, agents, "cell", Items.AGENTS, is_point=True),
+                Field("poacher", Kind.VECTOR, 1, "cell", is_point=True),
+            ),
+            action=MOVES,
+            symmetry=settings.left_of(whole),
+            nearly=whole,
+            control_period_s=0.25,
+            totals=("captures", "lone_landings", "collisions", "steps"),
+            terminates=True,
+            settings=settings.model_dump(),
+        )
 
     def _start(self, generator: torch.Generator) -> World:
         settings, agents = self.settings, self.settings.num_agents

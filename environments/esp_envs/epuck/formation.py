@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -17,11 +18,11 @@ from esp_envs.epuck.formation_spec import WHEEL_PAIRS, FormationSettings, format
 from esp_envs.epuck.gl import open_painter
 from esp_envs.epuck.physics import make_physics
 from esp_envs.epuck.robot import BODY_RADIUS_M, DIMENSIONS, MAX_WHEEL_SPEED, Array
-from esp_envs.scene import Painter, Scene
+from esp_envs.scene import PALE, Body, Painter, Scene, look
 from esp_envs.settings import TaskSettings
 from esp_envs.spec import TaskSpec
 
-_REMEMBERED = ("goals", "pillars", "mass", "friction", "wheel_factor", "pending", "arrived", "touching")
+_REMEMBERED = ("goals", "pillars", "wheel_factor", "pending", "arrived", "touching")
 
 
 class Formation(BatchedTask):
@@ -90,7 +91,6 @@ class Formation(BatchedTask):
         self._posts = np.broadcast_to(self.arena.posts(), (*robots, 2))
         self._pairs = np.array(WHEEL_PAIRS.points)
         self._furnish()
-        self._mass = self._friction = np.ones(robots)
         self._wheel_factor = np.ones((*robots, 2))
         self._pending = np.zeros((settings.action_delay, *robots, 2))
         self._arrived = np.zeros(robots, bool)
@@ -100,7 +100,7 @@ class Formation(BatchedTask):
         self._reach = np.array(radii) + BODY_RADIUS_M
         self._contact = self._reach + rules.CONTACT_GAP_M
         pose = np.concatenate([self._posts, np.zeros((*robots, 1))], -1)
-        self._place(pose, np.zeros_like(pose))
+        self._place(pose, np.zeros_like(pose), np.ones(robots), np.ones(robots))
 
     def _describe(self) -> TaskSpec:
         return formation_spec(self.settings)
@@ -125,15 +125,14 @@ class Formation(BatchedTask):
         own = {name: value.flatten(0, 1).cpu().numpy() for name, value in drawn.items()}
         self._furnish()
         self._wheel_factor = 1 + settings.wheel_mismatch * own["wheels"]
-        self._mass = 1 + settings.mass_spread * own["mass"]
-        self._friction = 1 + settings.friction_spread * own["friction"]
+        mass, friction = 1 + settings.mass_spread * own["mass"], 1 + settings.friction_spread * own["friction"]
         places = self._posts + settings.start_noise_m * own["place"]
         pose = np.concatenate([places, math.pi * own["heading"][..., None]], -1)
-        self._place(pose, np.zeros_like(pose))
+        self._place(pose, np.zeros_like(pose), mass, friction)
 
-    def _place(self, pose: Array, velocity: Array) -> None:
+    def _place(self, pose: Array, velocity: Array, mass: Array, friction: Array) -> None:
         self._pending[:], self._arrived[:] = 0, False
-        self.physics.place(pose, velocity, self._pillars, self._mass, self._friction)
+        self.physics.place(pose, velocity, self._pillars, mass, friction)
         self._look()
         self._touching = self._apart < self._contact
 
@@ -141,7 +140,8 @@ class Formation(BatchedTask):
         before, distance_before = self._position, self._distance
         self.physics.advance(self._wheel_speeds(action))
         self._look()
-        reward = rules.step_reward(self.settings, distance_before - self._distance, self._apart)
+        reward = self.settings.progress_weight * (distance_before - self._distance)
+        reward -= self.settings.penalty * (self._apart < self.settings.radius).any(-1)
         if not self.measures:
             return self._per_world(reward), {}
         ended = self._time + 1 == self.spec.horizon
@@ -240,9 +240,8 @@ class Formation(BatchedTask):
         self._goals = items("goals")
         if self.settings.num_obstacles:
             self._pillars = items("obstacles")
-        self._mass = self._friction = np.ones_like(self._mass)
         self._wheel_factor = np.ones_like(self._wheel_factor)
-        self._place(pose, velocity)
+        self._place(pose, velocity, np.ones(pose.shape[:2]), np.ones(pose.shape[:2]))
 
     def _to_save(self) -> dict[str, Tensor]:
         arrays = {name: getattr(self, f"_{name}") for name in _REMEMBERED}
@@ -270,8 +269,16 @@ class Formation(BatchedTask):
 
     def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
         w = world[0] * self.num_envs + world[1]
-        places = (self._goals[w], self._pillars[w], self._position[w], self._heading[w])
-        return rules.formation_scene(self.settings, *places)
+        goals, pillars, places = (of[w].tolist() for of in (self._goals, self._pillars, self._position))
+        radius, half = self.settings.obstacle_radius_m, self.arena.side_m / 2
+        goal = partial(Body, radius=BODY_RADIUS_M, shape="ring", model="goal", label="goal")
+        robot = partial(Body, radius=BODY_RADIUS_M, trail=True, model="robot", label="robot")
+        bodies = [
+            *(goal((x, y), **look(i)) for i, (x, y) in enumerate(goals)),
+            *(Body((x, y), radius, PALE, model="pillar", label="pillar") for x, y in pillars),
+            *(robot((x, y), heading=float(self._heading[w, i]), **look(i)) for i, (x, y) in enumerate(places)),
+        ]
+        return Scene(tuple(bodies), (-half, half, -half, half), unit="m")
 
     def painter(self, size: int) -> AbstractContextManager[Painter]:
         return open_painter(size)

@@ -1,4 +1,4 @@
-"""What robots of the formation see, what a step is worth, how hand-written policies steer, and the picture of it all.
+"""What robots of the formation see, and how hand-written policies steer.
 
 Everything works on all worlds at once. Vectors are in metres in the world frame.
 """
@@ -9,9 +9,7 @@ import math
 
 import numpy as np
 
-from esp_envs.epuck.formation_spec import FormationSettings
-from esp_envs.epuck.robot import BODY_RADIUS_M, MAX_SPEED_M_S, MAX_SPIN_RAD_S, Array
-from esp_envs.scene import PALE, Body, Scene, look
+from esp_envs.epuck.robot import MAX_SPEED_M_S, MAX_SPIN_RAD_S, Array
 
 FADING_M = 0.2  # gap over which the sight `nearness` of a body fades to 1/e
 RISKY_GAP_M = 0.05  # gap between two robots below which a state is risky (supplement of the paper)
@@ -45,11 +43,6 @@ def within(offset: Array, unit_m: float) -> Array:
     return offset / np.maximum(length(offset), unit_m)[..., None]
 
 
-def step_reward(settings: FormationSettings, progress: Array, apart: Array) -> Array:
-    """Return g_i + c_i [W, N] for `progress` [W, N] m; `apart` [W, N, N + M] m are to centres of robots and pillars."""
-    return settings.progress_weight * progress - settings.penalty * (apart < settings.radius).any(-1)
-
-
 def towards(wish: Array, heading: Array, control_period_s: float) -> Array:
     """Return wheel speeds, [W, N, 2] in [-1, 1], that turn to a wish [W, N, 2] m and drive along it."""
     error = np.arctan2(wish[..., 1], wish[..., 0]) - heading
@@ -77,20 +70,3 @@ def give_way(to_goal: Array, to_bodies: Array, gaps: Array) -> Array:
     swerve = SWERVE * ((near * facing)[..., None] * right).sum(-2)
     here = np.minimum(distance / SIGHT_M, 1)
     return (ahead * here + push + swerve * here) * SIGHT_M
-
-
-def formation_scene(
-    settings: FormationSettings, goals: Array, pillars: Array, position: Array, heading: Array
-) -> Scene:
-    """Return goals [N, 2], pillars [M, 2] and robots, at positions [N, 2] with headings [N], of one world."""
-    bodies = []
-    for i, goal in enumerate(goals.tolist()):
-        own = look(i)
-        bodies.append(Body(tuple(goal), BODY_RADIUS_M, shape="ring", model="goal", label="goal", **own))
-    radius = settings.obstacle_radius_m
-    bodies += [Body(tuple(place), radius, PALE, model="pillar", label="pillar") for place in pillars.tolist()]
-    for i, (place, turn) in enumerate(zip(position.tolist(), heading.tolist(), strict=True)):
-        robot = Body(tuple(place), BODY_RADIUS_M, heading=turn, trail=True, model="robot", label="robot", **look(i))
-        bodies.append(robot)
-    half = settings.arena.side_m / 2
-    return Scene(tuple(bodies), (-half, half, -half, half), unit="m")

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from esp_envs.errors import UserError
 
 Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 BODY_RADIUS_M = 0.037
 BODY_HEIGHT_M = 0.045

@@ -11,18 +11,11 @@ from functools import cache
 import torch
 from torch import Tensor
 
-LOOKAHEAD_S = 0.2  # for which the present velocity carries an agent on; found by search, it brakes in time
-FULL_FORCE_DISTANCE = 0.2  # that a step of full force makes in all (0.5 length/s, less by a quarter a step, 0.1 s)
 MOST_PLACES = 64  # that `places` should look for, for which it takes a second or two
 _STARTS, _WEISZFELD_STEPS = 16, 60
 MAX_SHARINGS = 4096  # most ways of sharing out landmarks that `shared_out` should try
 MOST_ASSIGNED = 2000  # agents or landmarks that `assigned` shares out by the Hungarian method, whose time is cubic
 TRAVEL_WEIGHT = 0.25  # of the distance to travel against that which remains, in `shared_out`; found by search
-
-
-def approach(goal: Tensor, position: Tensor, velocity: Tensor) -> Tensor:
-    """Return the force that each agent wishes for [N, 2, W] to come to rest at its goal."""
-    return (goal - position - LOOKAHEAD_S * velocity) / FULL_FORCE_DISTANCE
 
 
 @cache

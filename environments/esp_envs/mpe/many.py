@@ -18,7 +18,7 @@ class ManyWorlds(ParticleWorlds):
 
     Each of the `crowd` first agents sees as many nearest others of the crowd, and landmarks, as `sees` says; 0 for all.
     `touching` [A, W'] counts the agents that touch each, `squared_to_landmarks` [L, W'] is from each landmark to its
-    nearest agent, and `seen_agents` and `seen_landmarks` [W, crowd, k] are indices by distance, or None for all.
+    nearest agent, and `seen_agents` and `seen_landmarks` [W, crowd, k] are indices by distance, of k = 0 for all.
     """
 
     def __init__(
@@ -41,17 +41,14 @@ class ManyWorlds(ParticleWorlds):
         self.touching = torch.zeros(agents, lanes, device=device)
         self.squared_to_landmarks = torch.zeros(landmarks, lanes, device=device)
         self.seen_agents, self.seen_landmarks = (
-            torch.zeros(*seen, count, dtype=torch.int64, device=device) if sees else None for count in self._sees
+            torch.zeros(*seen, count, dtype=torch.int64, device=device) for count in self._sees
         )
         self._near = torch.zeros(3, 0, dtype=torch.int64, device=device)  # before any are placed, no pairs
         super().__init__(bodies, num_worlds, device, velocity_first)
 
     def measure(self) -> None:
         """Look at all pairs in their present positions, or at the near ones where they are found by a tree."""
-        by_tree = (
-            self.seen_agents is not None and self.bodies.num_agents >= BY_TREE and self.entity.device.type == "cpu"
-        )
-        if by_tree:
+        if self._sees[0] and self.bodies.num_agents >= BY_TREE and self.entity.device.type == "cpu":
             near = [self._measure_by_tree(world) for world in range(self.num_worlds)]
         else:
             near = [self._measure_all(worlds) for worlds in self._chunks]
@@ -68,9 +65,8 @@ class ManyWorlds(ParticleWorlds):
         touch = square[:, :, :agents] < reach[:, :agents].square().to(x.dtype)
         self.touching[:, worlds] = touch.sum(2).t().to(x.dtype)
         self.squared_to_landmarks[:, worlds] = square[:, :, agents:].amin(1).t()
-        if self.seen_agents is not None and self.seen_landmarks is not None:
-            self.seen_agents[worlds] = _nearest(square[:, :crowd, :crowd], self._sees[0])
-            self.seen_landmarks[worlds] = _nearest(square[:, :crowd, agents:], self._sees[1])
+        for seen, bodies in ((self.seen_agents, slice(crowd)), (self.seen_landmarks, slice(agents, None))):
+            seen[worlds] = square[:, :crowd, bodies].topk(seen.shape[-1], -1, largest=False).indices
         near = square[:, :, :solid] < (reach[:, :solid] + _NO_PUSH).square().to(x.dtype)
         world, first, second = near.nonzero().unbind(1)
         return torch.stack([world + worlds.start, first, second])
@@ -79,8 +75,6 @@ class ManyWorlds(ParticleWorlds):
         """Find the near pairs of one world; see `_measure_all`."""
         from scipy.spatial import KDTree  # noqa: PLC0415 - few need it, and it takes long to import
 
-        assert self.seen_agents is not None
-        assert self.seen_landmarks is not None
         agents, solid = self.bodies.num_agents, self._num_solid
         entity = self.entity[:, :, world].nan_to_num()  # a seed that failed has NaN, which no tree takes
         crowd, landmark = entity[: self._crowd], entity[agents:]
@@ -116,13 +110,7 @@ class ManyWorlds(ParticleWorlds):
         return change.view(2, *self.velocity[:, 0].shape).transpose(0, 1)
 
 
-def ways_to(seen: Tensor | None, places: Tensor, here: Tensor) -> Tensor:
+def ways_to(seen: Tensor, places: Tensor, here: Tensor) -> Tensor:
     """Return the ways [S, E, C, k, 2] from agents at `here` [S, E, C, 2] to those of places that they see [W, C, k]."""
-    assert seen is not None
     which = seen.view(*here.shape[:2], -1, 1).expand(-1, -1, -1, 2)
     return places.gather(2, which).unflatten(2, (here.shape[2], -1)) - here.unsqueeze(3)
-
-
-def _nearest(square: Tensor, count: int) -> Tensor:
-    """Return the index [..., count] of the least numbers along the last axis, the least first."""
-    return square.topk(count, -1, largest=False).indices

@@ -24,6 +24,8 @@ AGENT_RADIUS = 0.15
 _LANDMARK_RADIUS = 0.05  # for drawing only: landmarks touch nothing
 SENSITIVITY = 5.0  # acceleration of a full force, length / s^2
 OCCUPIED_WITHIN = 0.1  # a landmark counts as covered when an agent's centre is nearer than this (mpe2's capture radius)
+LOOKAHEAD_S = 0.2  # for which the present velocity carries an agent on; found by search, it brakes in time
+FULL_FORCE_DISTANCE = 0.2  # that a step of full force makes in all (0.5 length/s, less by a quarter a step, 0.1 s)
 LANDMARK_EXTENT = {"esp": 0.8, "pettingzoo": 1.0}
 
 
@@ -57,12 +59,6 @@ class NavigationSettings(ParticleSettings):
     @property
     def team(self) -> int:
         return self.num_agents
-
-    @property
-    def seen(self) -> tuple[int, int]:
-        """Landmarks and other agents that an agent sees."""
-        landmarks, others = self.landmarks, self.num_agents - 1
-        return (min(self.sees, landmarks), min(self.sees, others)) if self.sees else (landmarks, others)
 
     def without_effect(self) -> frozenset[str]:
         return frozenset({"local_ratio"} if self.convention == "esp" else ())
@@ -151,7 +147,7 @@ class Navigation(ParticleTask):
             observation=filled_layout(
                 Field("velocity", Kind.VECTOR, 1, "length/s"),
                 Field("position", Kind.VECTOR, 1, "length", is_point=True),
-                *_seen_fields(*settings.seen, sorts=settings.sees > 0),
+                *settings.seen_fields("landmarks", landmarks, "others"),
             ),
             state=layout(
                 Field("velocity", Kind.VECTOR, agents, "length/s", Items.AGENTS),
@@ -168,14 +164,13 @@ class Navigation(ParticleTask):
 
     def _bodies(self) -> Bodies:
         agents, landmarks = self.settings.num_agents, self.settings.landmarks
+        listed = range(0 if self.settings.many else agents)  # agents whose pairs are listed
         return Bodies(
             radius=(AGENT_RADIUS,) * agents + (_LANDMARK_RADIUS,) * landmarks,
             gain=(SENSITIVITY,) * agents,
             max_speed=None,
-            contacts=() if self.settings.many else tuple(itertools.combinations(range(agents), 2)),
-            watched=()
-            if self.settings.many
-            else tuple(itertools.product(range(agents), range(agents, agents + landmarks))),
+            contacts=tuple(itertools.combinations(listed, 2)),
+            watched=tuple(itertools.product(listed, range(agents, agents + landmarks))),
             extent=(self.settings.half_side,) * agents + (self.settings.extent,) * landmarks,
         )
 
@@ -193,7 +188,7 @@ class Navigation(ParticleTask):
         one_each = covering.assigned if self.settings.many else covering.one_each
         assign = covering.shared_out if name == "cover" else one_each
         goal = assign(position, landmark)
-        return self._to_action(covering.approach(goal, position, worlds.velocity))
+        return self._to_action((goal - position - LOOKAHEAD_S * worlds.velocity) / FULL_FORCE_DISTANCE)
 
     def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
         lane = world[0] * self.num_envs + world[1]
@@ -237,16 +232,3 @@ class Navigation(ParticleTask):
             "landmark_distance": distance / landmarks,
             "coverage": (nearest < OCCUPIED_WITHIN).sum(0) / landmarks,
         }
-
-
-def _seen_fields(landmarks: int, others: int, sorts: bool) -> tuple[Field, ...]:
-    """Return the fields of landmarks and of other agents; sorted by distance, no order of agents moves them."""
-    if not sorts:
-        return (
-            Field("landmarks", Kind.VECTOR, landmarks, "length", family="landmarks"),
-            Field("others", Kind.VECTOR, others, "length", Items.OTHERS),
-        )
-    return (
-        Field("near_landmarks", Kind.VECTOR, landmarks, "length", family="landmarks"),
-        Field("near_others", Kind.VECTOR, others, "length", family="others"),
-    )

@@ -76,21 +76,10 @@ def predator_prey_spec(settings: PredatorPreySettings) -> TaskSpec:
 
 
 def _predator_layout(settings: PredatorPreySettings) -> Layout:
-    others, obstacles, sees = settings.num_predators - 1, settings.num_obstacles, settings.sees
-    if sees:  # sorted by distance, so that no order of predators moves them
-        seen = (
-            Field("near_obstacles", Kind.VECTOR, min(sees, obstacles), "length", family="obstacles"),
-            Field("near_predators", Kind.VECTOR, min(sees, others), "length", family="others"),
-        )
-    else:
-        seen = (
-            Field("obstacles", Kind.VECTOR, obstacles, "length", family="obstacles"),
-            Field("predators", Kind.VECTOR, others, "length", Items.OTHERS),
-        )
     return filled_layout(
         Field("velocity", Kind.VECTOR, 1, "length/s"),
         Field("position", Kind.VECTOR, 1, "length", is_point=True),
-        *seen,
+        *settings.seen_fields("obstacles", settings.num_obstacles, "predators"),
         Field("prey", Kind.VECTOR, 1, "length", family="prey"),
         Field("prey_velocity", Kind.VECTOR, 1, "length/s", family="prey"),
     )

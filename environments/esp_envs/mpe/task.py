@@ -19,7 +19,7 @@ from esp_envs.batched import BatchedTask, Outcome, World, to_others
 from esp_envs.mpe.many import MOST_BODIES, ManyWorlds, ways_to
 from esp_envs.mpe.particles import Bodies, ParticleWorlds, exact_matmul
 from esp_envs.settings import Breaks, TaskSettings
-from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Continuous, Discrete, Field, Kind, layout
+from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Continuous, Discrete, Field, Items, Kind, layout
 
 STILL = (0.0, 0.0)
 MOVES = Discrete(Kind.VECTOR, (STILL, LEFT, RIGHT, DOWN, UP), ("no-op", "left", "right", "down", "up"))
@@ -78,6 +78,18 @@ class ParticleSettings(TaskSettings):
     def half_side(self) -> float:
         """Half the side of the square in which agents start, lengths."""
         return math.sqrt(self.team / self.density) if self.density else 1.0
+
+    def seen_fields(self, things: str, count: int, others: str) -> tuple[Field, ...]:
+        """Return the fields of things and of others; those sorted by distance are moved by no order of agents."""
+        if not self.sees:
+            return (
+                Field(things, Kind.VECTOR, count, "length", family=things),
+                Field(others, Kind.VECTOR, self.team - 1, "length", Items.OTHERS),
+            )
+        return (
+            Field(f"near_{things}", Kind.VECTOR, min(self.sees, count), "length", family=things),
+            Field(f"near_{others}", Kind.VECTOR, min(self.sees, self.team - 1), "length", family="others"),
+        )
 
     @property
     def many(self) -> bool:
