@@ -116,9 +116,9 @@ class Formation(BatchedTask):
             drawn = torch.rand(*robots, *shape, generator=generator, dtype=torch.float64, device=self.device)
             return drawn * 2 - 1
 
-        drawn = {"place": uniform(2), "heading": uniform()}
-        drawn["wheels"] = torch.randn(*robots, 2, generator=generator, dtype=torch.float64, device=self.device)
-        return drawn | {"mass": uniform(), "friction": uniform()}
+        places, headings = uniform(2), uniform()
+        wheels = torch.randn(*robots, 2, generator=generator, dtype=torch.float64, device=self.device)
+        return {"place": places, "heading": headings, "wheels": wheels, "mass": uniform(), "friction": uniform()}
 
     def _begin_with(self, drawn: World) -> None:
         settings = self.settings

@@ -146,15 +146,15 @@ def _arena(scene: Scene) -> list[str]:
     far, line, wall, middle = 20 * max(half_x, half_y), _GRID_WIDTH_M / 2, WALL_WIDTH_M / 2, WALL_HEIGHT_M / 2
     down, beside = grid_lines(x_min, x_max, GRID_SPACING), grid_lines(y_min, y_max, GRID_SPACING)
     things = [
-        _box((far, far, _LAYER_M), (x, y, -3 * _LAYER_M), _OUTSIDE),
-        _box((half_x, half_y, _LAYER_M), (x, y, -_LAYER_M), BACKGROUND),
-        *(_box((line, half_y, _LAYER_M), (place, y, -_LAYER_M / 2), GRID) for place in down),
-        *(_box((half_x, line, _LAYER_M), (x, place, -_LAYER_M / 2), GRID) for place in beside),
+        _geom("box", (far, far, _LAYER_M), (x, y, -3 * _LAYER_M), _OUTSIDE),
+        _geom("box", (half_x, half_y, _LAYER_M), (x, y, -_LAYER_M), BACKGROUND),
+        *(_geom("box", (line, half_y, _LAYER_M), (place, y, -_LAYER_M / 2), GRID) for place in down),
+        *(_geom("box", (half_x, line, _LAYER_M), (x, place, -_LAYER_M / 2), GRID) for place in beside),
     ]
     for side in (-1, 1):
         things += [
-            _box((wall, half_y, middle), (x + side * (half_x + wall), y, middle), FRAME),
-            _box((half_x + WALL_WIDTH_M, wall, middle), (x, y + side * (half_y + wall), middle), FRAME),
+            _geom("box", (wall, half_y, middle), (x + side * (half_x + wall), y, middle), FRAME),
+            _geom("box", (half_x + WALL_WIDTH_M, wall, middle), (x, y + side * (half_y + wall), middle), FRAME),
         ]
     return things
 
@@ -168,7 +168,7 @@ def _robot(body: Body) -> list[str]:
         _cylinder(radius * 0.62, height / 2 - plate, height / 2, _DARK),
         _cylinder(radius, (height - belt) / 2, (height + belt) / 2, _DARK),
         _cylinder(radius * 0.94, plate / 2, height + plate / 2, body.color),
-        _box((radius * 0.4, radius * 0.11, plate / 2), (radius * 0.55, 0, height + plate), _NOSE),
+        _geom("box", (radius * 0.4, radius * 0.11, plate / 2), (radius * 0.55, 0, height + plate), _NOSE),
         *(
             _geom("cylinder", (wheel, wheel * 0.15), (0, y, wheel), _DARK, 'zaxis="0 1 0"')
             for y in (-axle / 2, axle / 2)
@@ -186,10 +186,6 @@ def _goal(body: Body) -> list[str]:
 
 
 _SOLIDS = {"robot": _robot, "pillar": _pillar, "goal": _goal}
-
-
-def _box(half: Sequence[float], at: Sequence[float], color: str) -> str:
-    return _geom("box", half, at, color)
 
 
 def _cylinder(radius: float, half: float, height: float, color: str) -> str:

@@ -193,14 +193,10 @@ class PredatorPrey(ParticleTask):
         predators = self.settings.num_predators
         if self.settings.control == "prey":
             self._control[:predators] = self._as_control(self._chase())
-        if self._prey_learns:
-            return
-        if self.settings.prey == "random":
-            self._control[predators] = self._prey_plan[self._time]
         elif self.settings.prey == "fleeing":
             self._control[predators:] = self._as_control(self._flight())
-        else:
-            self._control[predators:] = 0.0
+        elif self.settings.prey == "random" and not self._prey_learns:
+            self._control[predators] = self._prey_plan[self._time]
 
     def _as_control(self, wish: Tensor) -> Tensor:
         return self._move_control(nearest_move(wish)) if self.settings.actions == "discrete" else unit_disc(wish)
