@@ -23,7 +23,7 @@ import torch
 from env_speed import figures, show
 
 from esp_envs import make
-from esp_envs.epuck.physics import ENGINES, make_physics
+from esp_envs.epuck.engines import ENGINES, make_physics
 from esp_envs.epuck.robot import MAX_WHEEL_SPEED, Arena
 
 ARENA = Arena(side_m=2.0, num_robots=8, num_pillars=2, pillar_radius_m=0.1)

@@ -14,7 +14,7 @@ import torch
 from esp_cli.export.export import export
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.training.build import build_environment
-from esp_envs.epuck.physics import make_physics
+from esp_envs.epuck.engines import make_physics
 from esp_envs.epuck.robot import MAX_WHEEL_SPEED, drive
 from tests.export.policies import drawn_policy
 

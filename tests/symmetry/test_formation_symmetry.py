@@ -21,7 +21,7 @@ from esp_cli.symmetry import (
 )
 from esp_cli.symmetry.maps import Dense
 from esp_envs import Environment, make
-from esp_envs.epuck.physics import ENGINES
+from esp_envs.epuck.engines import ENGINES
 from tests.symmetry.checks import environment_errors
 
 WORLDS = 6

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from esp_envs.batched import BatchedTask, Outcome, World
 from esp_envs.epuck import formation_rules as rules
+from esp_envs.epuck.engines import make_physics
 from esp_envs.epuck.formation_spec import WHEEL_PAIRS, FormationSettings, formation_spec, nearest_pair
 from esp_envs.epuck.gl import open_painter
-from esp_envs.epuck.physics import make_physics
 from esp_envs.epuck.robot import BODY_RADIUS_M, DIMENSIONS, MAX_WHEEL_SPEED, Array
 from esp_envs.scene import PALE, Body, Painter, Scene, look
 from esp_envs.settings import TaskSettings

@@ -1,7 +1,4 @@
-"""The physics engines: robots are placed, driven by wheel speeds, and read back.
-
-Adding one is one module and one line in `ENGINES`; it is imported when it is used.
-"""
+"""The contract of physics engines: robots are placed, driven by wheel speeds, and read back."""
 
 from __future__ import annotations
 
@@ -10,16 +7,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from esp_envs.epuck.gl import forget_missing_backend
 from esp_envs.epuck.robot import Arena, Array
 from esp_envs.errors import UserError
-from esp_envs.installed import load
 
-ENGINES = {
-    "mujoco": "esp_envs.epuck.mujoco_engines:MujocoPlanar",
-    "mujoco-3d": "esp_envs.epuck.mujoco_engines:MujocoSpatial",
-    "pymunk": "esp_envs.epuck.pymunk_engine:PymunkPlanar",
-}
 TIMESTEP_S = 0.01
 
 
@@ -67,14 +57,3 @@ class Physics(ABC):
     @abstractmethod
     def load_state_dict(self, arrays: dict[str, Array]) -> None:
         """Restore what `state_dict` of an engine of the same size returned."""
-
-
-def make_physics(name: str, arena: Arena, num_worlds: int, control_period_s: float) -> Physics:
-    """Make W worlds in the engine `name`; refuse one whose library is missing."""
-    forget_missing_backend()
-    try:
-        engine: type[Physics] = load(ENGINES[name])
-    except ImportError as error:
-        package = (error.name or name.partition("-")[0]).partition(".")[0]
-        raise UserError(f"the physics '{name}' needs the package {package}; pip install --upgrade {package}") from None
-    return engine(arena, num_worlds, control_period_s)

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from esp_envs.epuck.physics import Physics, make_physics
+from esp_envs.epuck.engines import make_physics
+from esp_envs.epuck.physics import Physics
 from esp_envs.epuck.robot import BODY_RADIUS_M, MAX_WHEEL_SPEED, Arena, Array
 
 PERIOD_S = 0.1

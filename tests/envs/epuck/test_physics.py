@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from esp_envs.epuck.physics import ENGINES, make_physics
+from esp_envs.epuck.engines import ENGINES, make_physics
 from esp_envs.epuck.robot import MAX_SPEED_M_S, Arena, Array
 from tests.envs.epuck.driving import PERIOD_S, engine
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from esp_envs.epuck.physics import ENGINES
+from esp_envs.epuck.engines import ENGINES
 from esp_envs.epuck.robot import BODY_RADIUS_M, MASS_KG, MAX_SPEED_M_S, MAX_WHEEL_SPEED, Arena, Array
 from tests.envs.epuck.driving import (
     PERIOD_S,

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from esp_envs.epuck.physics import ENGINES, Physics, make_physics
+from esp_envs.epuck.engines import ENGINES, make_physics
+from esp_envs.epuck.physics import Physics
 from esp_envs.epuck.robot import Arena, Array
 from tests.envs.epuck.driving import PERIOD_S, at_posts, at_random, bodies, engine, gap_between_robots, to_the_middle
 

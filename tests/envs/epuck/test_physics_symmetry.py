@@ -6,7 +6,7 @@ Rounding differs between the worlds, contacts magnify it, and robots that push e
 import numpy as np
 import pytest
 
-from esp_envs.epuck.physics import ENGINES
+from esp_envs.epuck.engines import ENGINES
 from esp_envs.epuck.robot import Arena, Array
 from tests.envs.epuck.driving import (
     at_posts,
