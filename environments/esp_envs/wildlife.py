@@ -116,14 +116,13 @@ class Wildlife(BatchedTask):
         self._half = self._size // 2
         self._points = torch.tensor(MOVES.points, device=device).long()
         self._step = torch.tensor([1, settings.width], device=device)  # from one cell's number to the next one's
-        self._busy = self._step.new_zeros(self.num_seeds, num_envs, settings.width * settings.height)
+        self._busy = self._step.new_zeros(*self._worlds_shape, settings.width * settings.height)
         pictures = all_pictures(settings.width, settings.height)
         # as wide as an observation, so that one copy of rows makes the observations
         self._rows = torch.nn.functional.pad(pictures, (0, 2 * (agents - 1))).to(device)
         basis = torch.eye(2 * min(agents, _FEW), dtype=torch.float64, device=device)
         self._others = to_others(basis.view(len(basis), -1, 2)).flatten(1)  # turns cells of drones into ways to others
-        lead = (self.num_seeds, num_envs)
-        self.plan = torch.zeros(settings.horizon, *lead, agents + 2, 2, dtype=torch.int16, device=device)
+        self.plan = torch.zeros(settings.horizon, *self._worlds_shape, agents + 2, 2, dtype=torch.int16, device=device)
         """[horizon, S, E, N + 2, 2], all that chance decides, drawn in advance: in each step the poacher's move, then
         the cells of drones and poacher with which an episode would begin. A new plan follows when it is used up."""
         self._put(torch.zeros(self.state_shape, device=device))

@@ -147,7 +147,7 @@ class Formation(BatchedTask):
         ended = self._time + 1 == self.spec.horizon
         metrics = self._measure(rules.length(self._position - before), ended)
         values = torch.from_numpy(np.array([*metrics.values()], np.float32))
-        values = values.view(-1, self.num_seeds, self.num_envs).to(self.device)
+        values = values.view(-1, *self._worlds_shape).to(self.device)
         return self._per_world(reward), dict(zip(metrics, values, strict=True))
 
     def _wheel_speeds(self, action: Tensor) -> Array:
@@ -224,8 +224,7 @@ class Formation(BatchedTask):
         return self._heading + self.settings.heading_noise_rad * noise[..., 0], seen + offsets
 
     def _per_world(self, values: Array) -> Tensor:
-        shaped = torch.from_numpy(values.astype(np.float32)).view(self.num_seeds, self.num_envs, *values.shape[1:])
-        return shaped.to(self.device)
+        return torch.from_numpy(values.astype(np.float32)).view(*self._worlds_shape, *values.shape[1:]).to(self.device)
 
     def _put(self, state: Tensor) -> None:
         rows = state.double().cpu().numpy().reshape(self.num_worlds, -1)
@@ -262,9 +261,8 @@ class Formation(BatchedTask):
         if name == "avoid":
             wish = rules.give_way(wish, self._ways, self._apart - self._reach)
         wheels = rules.towards(wish, self._heading, self.settings.control_period_s)
-        lead = (self.num_seeds, self.num_envs, self.settings.num_agents)
         if self.settings.actions == "discrete":
-            return nearest_pair(torch.from_numpy(wheels)).view(lead).to(self.device)
+            return nearest_pair(torch.from_numpy(wheels)).view(self._agents_shape).to(self.device)
         return self._per_world(wheels)
 
     def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:

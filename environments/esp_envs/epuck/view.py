@@ -36,6 +36,7 @@ _DARK, _NOSE, _OUTSIDE = "#2b2b30", "#fafaf7", "#dededa"
 _ASPECT = 3 / 4
 _MAX_GEOMS = 20_000
 _Label, _Line = mujoco.mjtGeom.mjGEOM_LABEL, mujoco.mjtGeom.mjGEOM_LINE
+_Mark = tuple[str, float, tuple[int, ...], Point, Point]  # letter, else width of a line in pixels; colour; two ends
 # A top that faces the light shows its colour as it is: what is ambient, diffuse and emitted adds up to 1. A side that
 # faces away is darker. Shadows would take ten times as long as all the rest.
 _MODEL = """<mujoco>
@@ -103,7 +104,7 @@ class SpacePainter:
         """Write letters above robots and lay the ways of bodies on the floor, while there is room for more shapes."""
         scale = self._size[0] / (scene.window[1] - scene.window[0])  # pixels per metre, nearly
         named = [body for body in scene.bodies if body.name and body.heading is not None]
-        marks = [(body.name, 1.0, (255, 255, 255), body.position, body.position) for body in named]
+        marks: list[_Mark] = [(body.name, 1.0, (255, 255, 255), body.position, body.position) for body in named]
         for body, path in trails(scene, trail):
             points, width = _thinned(path, body.radius * _TRAIL_STEP), body.radius * TRAIL_WIDTH * scale
             for k, ends in enumerate(pairwise(points), 1):

@@ -222,11 +222,10 @@ class ParticleTask(BatchedTask):
 
     def _to_action(self, wish: Tensor) -> Tensor:
         """Turn wishes [N, 2, W'] (1 is a full force) into a joint action of this task's kind."""
-        lead = (self.num_seeds, self.num_envs, self.spec.num_agents)
         wish = _turned(wish[:, :, : self.worlds.num_worlds], -self.settings.action_turn_rad)
         if self.settings.actions == "discrete":
-            return nearest_move(wish).t().reshape(lead)
-        return unit_disc(wish).permute(2, 0, 1).reshape(*lead, 2)
+            return nearest_move(wish).t().reshape(self._agents_shape)
+        return unit_disc(wish).permute(2, 0, 1).reshape(*self._agents_shape, 2)
 
     def _move_control(self, moves: Tensor) -> Tensor:
         """Return the controls [N, 2, W] of discrete moves [N, W]."""
