@@ -88,7 +88,7 @@ def settings() -> str:
                 f"`{s.name}`",
                 _written(s.default),
                 _elsewhere(s),
-                " ".join(filter(None, (s.bounds, s.unit))),
+                s.bounds,
                 s.description,
             )
             for s in section.settings

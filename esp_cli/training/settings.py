@@ -21,23 +21,6 @@ from esp_envs.errors import UserError
 from esp_envs.installed import Registry
 from esp_envs.registry import TASKS, task_class
 
-_UNITS = {
-    "_m": "m",
-    "_s": "s",
-    "_rad": "rad",
-    "_steps": "steps",
-    "_horizon": "steps",
-    "_truncation": "steps",
-    "_action_delay": "steps",
-    "_episodes": "episodes",
-    "_num_epochs": "epochs",
-    "_num_envs": "worlds",
-    "_num_agents": "agents",
-    "_landmark_extent": "length",
-}
-"""Units by the ending of a setting's name; a field may name another one as `json_schema_extra={"unit": ...}`."""
-
-
 Kind = Literal["algorithm", "task", "network", "prior", "evaluation"]
 
 
@@ -49,7 +32,6 @@ class Setting:
     type: str  # "integer", "number", "text", "flag", or "list of ..."
     default: Any  # where neither preset, task, file nor command line says something else
     bounds: str  # of its values in words: "from 1", "above 0 to 1", "relu, tanh"; empty for none
-    unit: str  # of its value; empty for a bare number
     description: str
     presets: Mapping[str, Any]  # values that a preset sets instead; "fast on navigation" on this task alone
     tasks: Mapping[str, Any]  # values that the preset default sets on a task instead
@@ -67,14 +49,9 @@ class Section:
 def sections() -> Iterator[Section]:
     """Yield the sections of everything that is built in: learners, tasks, networks, prior, evaluation."""
     for kind, (registry, _) in _KINDS.items():
-        yield from (_section(kind, name) for name in filter(registry.ships, registry))
+        yield from (section_of(kind, name) for name in filter(registry.ships, registry))
     yield Section("prior", "prior", _settings("prior", PriorConfig))
     yield Section("evaluation", "evaluation", _settings("evaluation", EvaluationConfig))
-
-
-def task_section(name: str) -> Section:
-    """Return the settings of one task, which may be of the caller; raises a UserError where there is no such task."""
-    return _section("task", name)
 
 
 def own_section(name: str) -> Section:
@@ -86,7 +63,7 @@ def own_section(name: str) -> Section:
         except UserError as refusal:
             refusals.append(str(refusal))
             continue
-        return _section(kind, name)
+        return section_of(kind, name)
     strange = f"'{name}' is no task, algorithm or network; check its base class"
     raise UserError(next((said for said in refusals if not said.startswith(f"'{name}' is not a")), strange))
 
@@ -98,7 +75,8 @@ _KINDS: dict[Kind, tuple[Registry[Any], Callable[[str], type[BaseModel]]]] = {
 }
 
 
-def _section(kind: Kind, name: str) -> Section:
+def section_of(kind: Kind, name: str) -> Section:
+    """Return the settings of one algorithm, task or network, which may be of the caller; a UserError if it is none."""
     return Section(name, kind, _settings(name if kind == "algorithm" else kind, _KINDS[kind][1](name)))
 
 
@@ -110,7 +88,6 @@ def _settings(section: str, model: type[BaseModel]) -> tuple[Setting, ...]:
             type=_type(schema[name]),
             default=schema[name].get("default"),
             bounds=_bounds(schema[name]),
-            unit=str(schema[name].get("unit", "")) or next((_UNITS[e] for e in _UNITS if f"_{name}".endswith(e)), ""),
             description=field.description or "",
             presets=_changes(section, name, PRESETS)
             | _changes(section, name, FAST, "fast on ")
@@ -217,16 +194,6 @@ def parse_config(data: object, source: Path, writer: object = __version__) -> Ru
         other = "" if writer == __version__ else f" (written by esp {str(writer)[:20]}, this is {__version__})"
         raise UserError(f"{source}: {one_sentence(error, RunConfig, 'config')}{other}") from None
     try:
-        learner = ALGORITHMS[config.algorithm]
+        return completed(config)
     except UserError as error:
         raise UserError(f"{source}: {error}") from None
-    _check_settings(task_class(config.task).Settings, config.task_settings, "task", source)
-    _check_settings(learner.config_class, config.algorithm_settings, config.algorithm, source)
-    return completed(config)
-
-
-def _check_settings(model: type[BaseModel], settings: object, section: str, source: Path) -> None:
-    try:
-        validate(model, settings)
-    except ValidationError as error:
-        raise UserError(f"{source}: {one_sentence(error, model, section)}") from None
