@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import pandas
 
 Floats = NDArray[np.float64]
-Value = float | int | None | Sequence[float | None] | NDArray[Any] | Tensor
+Value = float | None | list[float | None] | Tensor
 """What a row may hold under a name: a number, or one per seed; None where there is none, as for a stopped seed."""
 
 
@@ -205,19 +205,14 @@ def elapsed_s(row: Mapping[str, Any]) -> float:
     return float(seconds) if isinstance(seconds, int | float) else 0.0
 
 
-def _plain(name: str, value: Value) -> float | int | list[float | int | None] | None:
+def _plain(name: str, value: Value) -> float | list[float | None] | None:
     """Return a number, or a list of numbers, with None where it is not finite."""
-    plain = value.tolist() if isinstance(value, Tensor | np.ndarray | np.generic) else value
-    return [_number(name, item) for item in plain] if isinstance(plain, list | tuple) else _number(name, plain)
-
-
-def _number(name: str, value: Any) -> float | int | None:
-    number = value.item() if isinstance(value, np.generic) else value
-    if number is None:
-        return None
-    if not isinstance(number, bool | int | float):
+    plain = value.tolist() if isinstance(value, Tensor) else value
+    numbers = plain if isinstance(plain, list) else [plain]
+    if not all(number is None or isinstance(number, int | float) for number in numbers):
         raise MetricsError(f"the metric '{name}' is neither a number nor a list of one number per seed")
-    return number if math.isfinite(number) else None
+    finite = [None if number is None or not math.isfinite(number) else number for number in numbers]
+    return finite if isinstance(plain, list) else finite[0]
 
 
 def _rows(path: Path) -> Iterator[tuple[bytes, dict[str, Any]]]:
