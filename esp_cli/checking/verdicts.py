@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from statistics import NormalDist
 from typing import Literal, TypeVar
 
 from esp_cli.checking.shifting import Shift
@@ -20,12 +19,10 @@ SIGNIFICANT = 6.0  # standard errors of a gap that is a breaking: of thousands o
 NEGLIGIBLE = 1e-3  # gap against the field's spread below which a difference is rounding
 LATE = "not tried, as the time was over"
 LEVEL = 0.05  # probability with which an element that is off by the tolerance may be said to hold, at most
-
-
 Named = TypeVar("Named", bound=Element | Shift)
 
 
-class Late(Exception):  # noqa: N818 - what is left is not covered, which is no error
+class Late(BaseException):  # what is left is not covered, which is no error of the task
     """The time for a check is over."""
 
 
@@ -87,27 +84,21 @@ def may_come(field: str, ends: bool, pays: bool) -> bool:
     return field == "end" or (field == "reward" and not (ends and pays))
 
 
-def chance(gap: float, tolerance: float, error: float) -> float:
-    """Return how likely a normal gap is to be this small, if its expectation is the tolerance."""
-    return NormalDist().cdf((gap - tolerance) / max(error, 1e-12))
-
-
 def verdicts_of(
     elements: Sequence[Named],
     judge: Callable[[Named], ElementVerdict],
     is_declared: Callable[[Named], bool],
     watch: Watch = lambda *_: None,
     until: float = math.inf,
-    spare: float = math.inf,
 ) -> list[ElementVerdict]:
     """Judge elements, declared ones first, and tell how many of how many are done.
 
-    At `until` of `time.monotonic` the rest is not tried and so not covered, at `spare` what nobody declared.
+    At `until` of `time.monotonic` the rest is not tried and so not covered.
     """
     found = dict[Named, ElementVerdict]()
     for done, element in enumerate(sorted(elements, key=lambda one: not is_declared(one)), 1):
         try:
-            stop_at(until if is_declared(element) else min(until, spare))
+            stop_at(until)
             found[element] = judge(element)
         except Late:
             found[element] = ElementVerdict(element.name, is_declared(element), (), LATE)

@@ -206,13 +206,6 @@ def _canonical(value: Any) -> bytes:
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode("ascii")
 
 
-def same(a: Tensor, b: Tensor) -> bool:
-    """Return whether two tensors are equal bit for bit, NaN included."""
-    # cloned, since a part of a longer buffer has strides that no view as bytes can have
-    x, y = (t.cpu().flatten().clone(memory_format=torch.contiguous_format).view(torch.uint8) for t in (a, b))
-    return a.dtype == b.dtype and a.shape == b.shape and torch.equal(x, y)
-
-
 def describe_policy(config: RunConfig, spec: TaskSpec, step: int, returns: Sequence[float]) -> dict[str, Any]:
     """Return the description by which a policy file is used without its run folder."""
     return {
