@@ -15,7 +15,7 @@ import math
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,9 +26,6 @@ from esp_cli.files.opening import open_own, open_regular
 from esp_cli.files.writing import MAX_LINE_BYTES, TAIL_BYTES, replacing, write_all
 from esp_cli.training.trackers import Guarded
 from esp_envs.errors import UserError
-
-if TYPE_CHECKING:
-    import pandas
 
 Floats = NDArray[np.float64]
 Value = float | None | list[float | None] | Tensor
@@ -129,7 +126,7 @@ def column(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[NDArray[np.int
     return np.array([step for step, _ in found], dtype=np.int64), values
 
 
-class Metrics(Shown, Mapping[str, Floats]):
+class Metrics(Shown, dict[str, Floats]):
     """Metrics by name: one row per update, one column per seed, [U, S]; [U, 1] of what the run has as a whole.
 
     Example:
@@ -149,54 +146,22 @@ class Metrics(Shown, Mapping[str, Floats]):
     def __init__(self, rows: Sequence[Mapping[str, Any]], seeds: Sequence[int]) -> None:
         self.seeds = tuple(seeds)
         self.steps: NDArray[np.int64] = np.array([row["step"] for row in rows], dtype=np.int64)
-        self._arrays: dict[str, Floats] = {}
-        self._whole: set[str] = set()
         for index, row in enumerate(rows):
             for name, value in row.items():
                 if name == "step":
                     continue
-                if name not in self._arrays:
-                    columns = len(self.seeds) if isinstance(value, list) else 1
-                    self._arrays[name] = np.full((len(rows), columns), math.nan)
-                    self._whole |= set() if isinstance(value, list) else {name}
-                self._arrays[name][index] = np.array(value, dtype=np.float64)
+                columns = len(self.seeds) if isinstance(value, list) else 1
+                array = self.setdefault(name, np.full((len(rows), columns), math.nan))
+                array[index] = np.array(value, dtype=np.float64)
 
     def _facts(self) -> Mapping[str, object]:
         """Return what there is, and the newest mean over seeds of what was evaluated."""
-        last = {name: array[np.isfinite(array).all(1)][-1:] for name, array in self._arrays.items() if "eval/" in name}
+        last = {name: array[np.isfinite(array).all(1)][-1:] for name, array in self.items() if "eval/" in name}
         newest = {name: f"{rows.mean():.4g}" for name, rows in last.items() if rows.size}
         what = (
             f"{len(self.steps)} of {len(self)} names, steps {self.steps.min(initial=0)} to {self.steps.max(initial=0)}"
         )
         return {"rows": what, "seeds": ", ".join(map(str, self.seeds)), **newest}
-
-    def __getitem__(self, name: str) -> Floats:
-        return self._arrays[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._arrays)
-
-    def __len__(self) -> int:
-        return len(self._arrays)
-
-    def to_pandas(self) -> pandas.DataFrame:
-        """Return a table indexed by steps, with columns (metric, seed); "run" stands for what the run has as a whole.
-
-        Raises:
-            UserError: pandas is not installed.
-        """
-        try:
-            import pandas as pd  # noqa: PLC0415 - not a dependency
-        except ImportError:
-            raise UserError("to_pandas needs pandas, which is not installed: pip install pandas") from None
-        columns = {
-            (name, seed): array[:, column]
-            for name, array in self._arrays.items()
-            for column, seed in enumerate(("run",) if name in self._whole else self.seeds)
-        }
-        table = pd.DataFrame(columns, index=pd.Index(self.steps, name="step"))
-        table.columns = table.columns.set_names(["metric", "seed"])
-        return table
 
 
 def elapsed_s(row: Mapping[str, Any]) -> float:
