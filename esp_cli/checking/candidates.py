@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import torch
@@ -110,19 +112,16 @@ def _elements(text: str, num_agents: int) -> tuple[Element, ...]:
     elements = tuple(element for element in elements if not element.is_identity)
     if len(elements) <= _MOST:
         return elements
-    chosen: list[Element] = []
-    generating = dict[frozenset[Any], list[Element]]()  # by what they act on
-    reached: set[Element] = set()
+    chosen, reached = list[Element](), set[Element]()
+    generating = defaultdict[frozenset[Any], list[Element]](list)  # by what they act on
     for element in elements:
         if element in reached or all(element.restricted(frozenset([aspect])) in reached for aspect in element.aspects):
             continue
         chosen.append(element)
-        alike = generating.setdefault(element.aspects, [])
-        try:
-            reached.update(FiniteGroup.generated_by(element.name, [*alike, element]).elements)
-        except ValueError:  # its products are too many to list, so it stands for itself
-            continue
-        alike.append(element)
+        alike = [*generating[element.aspects], element]
+        with suppress(ValueError):  # its products are too many to list, so it stands for itself
+            reached.update(FiniteGroup.generated_by(element.name, alike).elements)
+            generating[element.aspects] = alike
     return tuple(chosen)
 
 
@@ -219,8 +218,7 @@ def _listed(text: str) -> tuple[Element, ...]:
 
 def _is_readable(text: str, accepted: Sequence[Element]) -> bool:
     """Return whether `--transforms` takes a text; it takes no list that holds a sampled group."""
-    try:
+    with suppress(ValueError):
         parse_elements(text, max((len(e.permutation or ()) for e in accepted), default=1))
-    except ValueError:
-        return False
-    return True
+        return True
+    return False
