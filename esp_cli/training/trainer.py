@@ -251,7 +251,7 @@ class Trainer:
         for name in sorted(names):
             a, b, stored = before.get(name), now.get(name), tensors.get(name)
             fits = b is not None and stored is not None and b.dtype == stored.dtype and equal(b.cpu(), stored)
-            if fits and a is not None:  # a replay has grown, and checks its shapes itself
-                fits = a.dtype == stored.dtype and (a.shape == stored.shape or name.startswith("replay."))
+            if fits and a is not None and b is not None:  # a replay has grown, and checks its shapes itself
+                fits = a.dtype == b.dtype and (a.shape == b.shape or name.startswith("replay."))
             if not fits:
                 raise UserError(f"the checkpoint in {self.folder.path} does not fit this configuration ({name})")
