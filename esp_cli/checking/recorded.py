@@ -1,21 +1,28 @@
-"""Transitions of anybody, or collected from a task: what they say of each agent, and their images."""
+"""Transitions of anybody: collected from a task or read from a file, what they say of each agent, and their images."""
 
 from __future__ import annotations
 
 import math
 import time
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from esp_cli.checking.verdicts import Watch
 from esp_cli.symmetry import Transform
 from esp_envs.base import Environment
+from esp_envs.errors import UserError
+from esp_envs.spec import Discrete, Spaces
 
 EPISODES = 2048
 STEPS = 8  # steps of each episode that are looked at
+_MOST_BYTES = 2**31
+_NEEDED, _OPTIONAL = ("obs", "action", "reward", "next_obs"), ("action_mask", "terminated")
 
 
 @dataclass(frozen=True)
@@ -110,3 +117,50 @@ def turned(data: Transitions, transform: Transform) -> Transitions:
     moves |= {"action_mask": transform.push_outputs}
     parts = {name: part.unsqueeze(0) for name, part in vars(data).items() if part is not None}
     return Transitions(**{name: moves.get(name, transform.per_agent)(part)[0] for name, part in parts.items()})
+
+
+def read_transitions(path: Path, spaces: Spaces) -> Transitions:
+    """Read the transitions of a file; reading never runs code.
+
+    Args:
+        path: of an .npz file with obs and next_obs [M, T, N, D], action [M, T, N] of integers or [M, T, N, width],
+            reward [M, T, N], and where the task has them action_mask [M, T, N, A] and terminated [M, T, N]; the axis T
+            may be left out.
+        spaces: what the numbers are.
+
+    Raises:
+        UserError: it is missing, damaged or too large, or holds no numbers. `check_transitions` refuses other shapes.
+    """
+    arrays = _arrays(path)
+    missing = [name for name in _NEEDED if name not in arrays]
+    if missing:
+        raise UserError(f"{path} has no array {', '.join(missing)}; save {', '.join(_NEEDED)} with np.savez")
+    whole = isinstance(spaces.action, Discrete)
+    tensors = {}
+    for name, array in arrays.items():
+        integer = whole and name == "action"
+        if array.dtype.kind not in ("iu" if integer else "fiub"):
+            raise UserError(f"'{name}' of {path} holds {array.dtype}; save {'integers' if integer else 'numbers'}")
+        tensor = torch.from_numpy(array.astype(np.int64 if integer else np.float32))
+        per_agent = name in ("reward", "terminated") or integer
+        tensors[name] = tensor.unsqueeze(1) if tensor.ndim == (2 if per_agent else 3) else tensor
+    mask, ends = tensors.pop("action_mask", None), tensors.pop("terminated", None)
+    allowed = None if mask is None or not whole else mask > 0
+    return Transitions(**tensors, action_mask=allowed, terminated=None if ends is None else ends > 0)
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays that are looked for."""
+    if not path.is_file():
+        raise UserError(f"there is no file {path}; give the path of an .npz file")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(item.file_size for item in archive.infolist())
+        if size > _MOST_BYTES:
+            raise UserError(f"it unpacks to {size / 1e9:.1f} GB, and at most {_MOST_BYTES / 1e9:.1f} GB are read")
+        with np.load(path, allow_pickle=False) as file:
+            found = [name for name in (*_NEEDED, *_OPTIONAL) if name in file.files]
+            return {name: file[name] for name in found}
+    except Exception as error:  # whatever a damaged archive or header makes zipfile and NumPy raise
+        reason = (str(error).splitlines() or [type(error).__name__])[0][:200]
+        raise UserError(f"{path} is not an intact .npz file ({reason}); save it again with np.savez") from None

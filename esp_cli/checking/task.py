@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 from esp_cli.checking import comparison, paired, transitions
 from esp_cli.checking.candidates import candidates, named, refused
-from esp_cli.checking.recorded import collect
+from esp_cli.checking.recorded import Transitions, collect
 from esp_cli.checking.shifting import SHIFT, Shift
 from esp_cli.checking.verdicts import ElementVerdict, Watch
 from esp_cli.symmetry import Element
@@ -34,7 +34,7 @@ _SEVERAL = "no state holds these items, and each agent's transitions do not show
 class SymmetryReport:
     """What a check found."""
 
-    task: str  # its name
+    task: str  # its name, or the file of transitions
     method: str  # "paired states" or "transitions"
     declared: str
     found: str  # the largest group whose tried elements all hold: "d4*agents", "flip-x", "c1" for nothing
@@ -82,10 +82,21 @@ def check_symmetry(
     elements = [] if transforms == SHIFT else candidates(spec, transforms)
     shifts = [Shift(spec)] if transforms == SHIFT or (transforms is None and spec.shifts) else []
     method, verdicts = judged(make, [*elements, *shifts], from_transitions, watch, until)
-    holding = [e for e, verdict in zip(elements, verdicts, strict=False) if verdict.outcome == "holds"]
-    found, usable = named(holding, elements, scene_of(spec.symmetry, spec.num_agents))
-    left_out = {} if transforms in (None, SHIFT) else refused(spec, transforms)
-    return SymmetryReport(spec.name, method, spec.symmetry, found, usable, tuple(verdicts), left_out)
+    return _reported(spec.name, method, spec, elements, verdicts, transforms)
+
+
+def check_recorded(
+    source: str,
+    spaces: Spaces,
+    data: Transitions,
+    transforms: str | None = None,
+    watch: Watch = lambda *_: None,
+    seconds: float = math.inf,
+) -> SymmetryReport:
+    """Judge transitions of a policy that prefers no direction, from whatever source; see `check_symmetry`."""
+    elements = candidates(spaces, transforms)
+    verdicts = transitions.check_transitions(spaces, data, elements, watch, time.monotonic() + seconds)
+    return _reported(source, TRANSITIONS, spaces, elements, verdicts, transforms)
 
 
 def judged(
@@ -125,3 +136,17 @@ def judged(
 def _is_carried(element: Element | Shift, spaces: Spaces) -> bool:
     named = {field.name for field in spaces.state.fields}
     return spaces.joint_fields is not None or all(name in named or name == AGENTS for name, _ in element.orders)
+
+
+def _reported(
+    source: str,
+    method: str,
+    spaces: Spaces,
+    elements: Sequence[Element],
+    verdicts: Sequence[ElementVerdict],
+    transforms: str | None,
+) -> SymmetryReport:
+    holding = [e for e, verdict in zip(elements, verdicts, strict=False) if verdict.outcome == "holds"]
+    found, usable = named(holding, elements, scene_of(spaces.symmetry, spaces.num_agents))
+    left_out = {} if transforms in (None, SHIFT) else refused(spaces, transforms)
+    return SymmetryReport(source, method, spaces.symmetry, found, usable, tuple(verdicts), left_out)

@@ -1,4 +1,4 @@
-"""`esp discover`: which symmetries does a task have?"""
+"""`esp discover`: which symmetries does a task have, or the transitions that somebody recorded?"""
 
 from __future__ import annotations
 
@@ -20,12 +20,18 @@ if TYPE_CHECKING:
 EPILOG = """Examples:\n
     esp discover navigation --set task.wind=0.3\n
     esp discover runs/navigation --json found.json\n
+    esp discover transitions.npz --task rendezvous:Rendezvous\n
     esp train --task navigation --transforms discovered"""
 
 
 def discover(
-    what: Annotated[str, Argument(help="A task or a run folder.", metavar="TASK|RUN")],
-    task: Annotated[str | None, Option("--task", "-t", help="The module:Class of a run of yours.")] = None,
+    what: Annotated[
+        str, Argument(help="A task, a run folder, or an .npz file of transitions.", metavar="TASK|RUN|FILE")
+    ],
+    task: Annotated[
+        str | None,
+        Option("--task", "-t", help="Task whose layout the transitions of a file have, or a run's own module:Class."),
+    ] = None,
     transforms: Annotated[str | None, Option("--transforms", help="Elements to try, as d8; by default many.")] = None,
     settings: TaskSetOption = None,
     logs: Annotated[bool, Option("--logs", help="Judge from transitions alone, also where states can be set.")] = False,
@@ -50,15 +56,25 @@ def discover(
 def _discovery(
     what: str, task: str | None, transforms: str | None, settings: dict[str, object], logs: bool, seconds: float
 ) -> SymmetryReport:
-    from esp_cli.checking import check_symmetry
+    from esp_cli.checking import check_recorded, check_symmetry
+    from esp_cli.checking.recorded import read_transitions
     from esp_cli.training.config import resolve_task_settings
     from esp_envs.registry import make
 
     path = Path(what)
     register_named([task, None if path.exists() else what])
+    if path.suffix == ".npz" or path.is_file():
+        if task is None:
+            raise UserError(f"{what} does not say what its numbers are; add --task")
+        if logs:
+            raise UserError(f"{what} is a file, of which nothing but transitions is known; leave --logs out")
+        spec = make(task, 1, [0], resolve_task_settings(task, settings)).spec
+        data = read_transitions(path, spec)
+        with console.watching("check", "elements") as watch:
+            return check_recorded(what, spec, data, transforms, watch, seconds)
     name = what
     if task is not None and not path.is_dir():
-        raise UserError(f"--task is for a run, and there is no {what}; leave it out")
+        raise UserError(f"--task is for a run, or a file of transitions, and there is no {what}; leave it out")
     if path.is_dir():
         from esp_cli.training.run_folder import RunFolder
         from esp_cli.training.settings import parse_config

@@ -1,8 +1,8 @@
 """Symmetries that nobody declared: found in tasks and in logs, and none found where there is none."""
 
 import json
-import re
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ import torch
 from esp_cli.checking import (
     SymmetryReport,
     Transitions,
+    check_recorded,
     check_symmetry,
     check_transitions,
     collect,
@@ -20,6 +21,7 @@ from esp_cli.checking import (
 )
 from esp_cli.checking.comparison import state_by_state
 from esp_cli.checking.measured import prepared
+from esp_cli.checking.recorded import read_transitions
 from esp_cli.checking.verdicts import LATE, ElementVerdict, FieldVerdict, Late, concluded, verdicts_of
 from esp_cli.symmetry import Element, parse_elements, transform_set
 from esp_cli.training.build import build_learner
@@ -158,38 +160,74 @@ def test_what_is_found_is_complete_in_whatever_order_fields_stand() -> None:
     assert named(found, found) == (whole, f"discovered:{whole}")
 
 
-def test_what_is_found_is_told_and_can_be_trained_with(tmp_path: Path) -> None:
-    out, tried = tmp_path / "found.json", "d4,rot45,agents-1-0-2,agents-0-2-1,landmarks-1-0-2,landmarks-0-2-1"
-    wind = ("--set", "task.actions=continuous", "--set", "task.wind=0.3")
-    shown = esp("discover", "navigation", *wind, "--transforms", tried, "--json", out)
+@cache
+def windy() -> dict[str, np.ndarray]:
+    data = collect(make("navigation", 128, [0], {"actions": "continuous", "wind": 0.3}), 1536)
+    return {name: getattr(data, name).numpy() for name in ("obs", "action", "reward", "next_obs")}
+
+
+def recorded(folder: Path, **changes: object) -> Path:
+    arrays = windy() | changes
+    path = folder / "transitions.npz"
+    np.savez(path, **{name: array for name, array in arrays.items() if array is not None})
+    return path
+
+
+def test_a_file_of_transitions_is_judged_and_what_is_found_can_be_trained_with(tmp_path: Path) -> None:
+    path, out = recorded(tmp_path), tmp_path / "found.json"
+    tried = "d4,rot45,agents-1-0-2,agents-0-2-1,landmarks-1-0-2,landmarks-0-2-1"
+    options = ("--set", "task.actions=continuous", "--transforms", tried, "--json", out)
+    shown = esp("discover", path, "--task", "navigation", *options)
     assert "found flip-x*agents" in shown.stdout
     assert "--transforms discovered:flip-x*agents" in shown.stderr
     told = json.loads(out.read_text())
     assert told["group"] == "flip-x*agents*landmarks-3"
     assert told["transforms"] == "discovered:flip-x*agents*landmarks-3"
+    spec = make("navigation", 1, [0], FORCES).spec
+    data = read_transitions(path, spec)
+    flat = Transitions(*(part.flatten(0, 1).unsqueeze(1) for part in vars(data).values() if part is not None))
+    assert check_recorded("rows", spec, flat, "rot90,flip-x").found == "flip-x"
+    late = check_recorded("rows", spec, flat, "rot90,flip-x", seconds=0).elements
+    assert {element.outcome for element in late} == {"not covered"}
 
 
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"reward": torch.zeros(1536, 8, 2)}, "'reward' of the transitions has shape [1536, 8, 2]"),
-        ({"reward": torch.full((1536, 8, 3), torch.nan)}, "not finite"),
-        ({"obs": torch.zeros(64)}, "'obs' of the transitions has shape [64]"),
-        ({"action_mask": torch.tensor(True)}, "'action_mask' of"),
-        ({"obs": torch.zeros(1536, 0, 3, 14)}, "'obs' of the transitions has shape [1536, 0, 3, 14]"),
+        ({"obs": None}, "has no array obs"),
+        ({"reward": np.zeros((1536, 8, 2))}, "'reward' of"),
+        ({"action": np.zeros((1536, 8, 3, 2), dtype=complex)}, "holds complex128"),
+        ({"reward": np.full((1536, 8, 3), np.nan)}, "not finite"),
+        ({"reward": np.zeros((100, 8, 3))}, "'reward' of the transitions has shape [100, 8, 3]"),
+        ({"obs": np.array([{}], dtype=object)}, "not an intact .npz file"),
     ],
 )
-def test_transitions_that_do_not_fit_are_refused(changes, sentence: str) -> None:
-    env = make("navigation", 128, [0])
-    data = replace(collect(env, 1536), **changes)
-    with pytest.raises(ValueError, match=re.escape(sentence)):
-        check_transitions(env.spec, data, parse_elements("rot90", 3))
+def test_a_file_that_does_not_fit_is_refused(tmp_path: Path, changes, sentence: str) -> None:
+    path = recorded(tmp_path, **changes)
+    said = refused("discover", path, "--task", "navigation", "--set", "task.actions=continuous")
+    assert sentence in said
 
 
-def test_what_is_no_run_or_task_is_refused(tmp_path: Path) -> None:
+def test_what_is_no_file_run_or_task_is_refused(tmp_path: Path) -> None:
+    junk = tmp_path / "junk.npz"
+    junk.write_bytes(b"PK\x03\x04 no archive")
+    assert "is not an intact .npz file" in refused("discover", junk, "--task", "navigation")
+    assert "does not say what its numbers are; add --task" in refused("discover", recorded(tmp_path))
+    navigation = ("--task", "navigation")
+    assert "there is no file" in refused("discover", tmp_path / "none.npz", *navigation)
+    forces = ("--set", "task.actions=continuous")
+    assert "'obs' of" in refused("discover", recorded(tmp_path, obs=np.zeros(64)), *navigation, *forces)
+    scalar = recorded(tmp_path, action=np.zeros((1536, 8, 3), int), action_mask=np.array(True))
+    assert "'action_mask' of" in refused("discover", scalar, *navigation)
+    nothing = {"obs": (1536, 0, 3, 14), "next_obs": (1536, 0, 3, 14), "action": (1536, 0, 3), "reward": (1536, 0, 3)}
+    empty = {name: np.zeros(shape, int if name == "action" else float) for name, shape in nothing.items()}
+    assert "'obs' of the transitions has shape [1536, 0, 3, 14]" in refused(
+        "discover", recorded(tmp_path, **empty), *navigation
+    )
     assert "unknown task 'nowhere'" in refused("discover", "nowhere")
     assert "there is no navigation; leave it out" in refused("discover", "navigation", "--task", "navigation")
     assert "is no run folder" in refused("discover", tmp_path, "--task", "navigation")
+    assert "leave --logs out" in refused("discover", recorded(tmp_path), "--logs", *navigation)
 
 
 def test_what_breaks_only_the_mask_of_actions_is_broken() -> None:

@@ -12,10 +12,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from typer.testing import CliRunner
 
 from esp_cli.app import app
+from esp_cli.checking import collect
+from esp_cli.checking.recorded import read_transitions
 from esp_cli.files.documents import DocumentFormat, parse_object
 from esp_cli.policies.bundled import MANIFEST, MANIFEST_FORMAT, Manifest, bundled_folder
 from esp_cli.policies.loading import TrainedPolicy
@@ -165,6 +168,9 @@ def _make_sound_files(scratch: Path) -> None:
         with run.lock():
             Trainer(cell.config, run).run(lambda news: True)
         _run_command(["eval", str(run.path), "--episodes", "4", "--json", str(study.evaluation_path(cell))])
+    recorded = collect(make("navigation", 64, [0]), 64, 2)
+    arrays = {name: getattr(recorded, name).numpy() for name in ("obs", "action", "reward", "next_obs")}
+    np.savez(scratch / "transitions.npz", **arrays)
     search(scratch / "tuning", TUNING)
     many = {"task.num_agents": 12, "task.sees": 3, "task.density": 8.0, "network.name": "set", "network.width": 8}
     crowd = tiny_folder(scratch / "crowd", steps=100, **{name.replace(".", "__"): x for name, x in many.items()})
@@ -271,6 +277,10 @@ def _spec() -> TaskSpec:
     return make("navigation", 1, [0]).spec
 
 
+def _transitions(path: Path) -> None:
+    read_transitions(path, _spec())
+
+
 def _orders(path: Path) -> None:
     config = resolve_config("navigation", overrides=read_config_file(path).settings)
     admitted_elements(config.prior.transforms, _spec())
@@ -306,6 +316,7 @@ _ALL = (
     (f"{STUDY}/study.json", _study, "report {scratch}/study --json -", spoil_json),
     ("evaluation/final-evaluation.json", _evaluation, "report {scratch}/study", spoil_json),
     (f"bundled/{MANIFEST}", _manifest, "policies", spoil_json),
+    ("transitions.npz", _transitions, "discover {scratch}/transitions.npz --task navigation", spoil_bytes),
     ("tuning/journal.jsonl", _journal, "report {scratch}/tuning", spoil_json),
     ("tuning/tuning.json", _tuning, "report {scratch}/tuning", spoil_json),
     ("crowd/policy.safetensors", _policy, "eval {scratch}/crowd -e 2", spoil_header),
@@ -321,6 +332,7 @@ _NAMES = (
     "study",
     "evaluation",
     "manifest",
+    "transitions",
     "journal",
     "tuning",
     "crowd",
