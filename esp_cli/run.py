@@ -111,7 +111,7 @@ class Run(Shown):
         """Hold the folder against other processes, and yield what trains it from its newest checkpoint on.
 
         Args:
-            track: names of trackers that get the metrics too: "tensorboard", "wandb".
+            track: names of trackers that get the metrics too: "tensorboard", "wandb", "mlflow".
             check: take a short look at a task that is not built in before a new run begins.
         """
         resolve_device(self.config.device)
@@ -239,7 +239,7 @@ def train(
         out: the run folder; by default a new one in runs/.
         init_from: start from this policy (a run folder, a policy file or a bundled policy) where the shapes fit.
         listener: told of progress after every update; where it returns False the run stops, and `Run.train` goes on.
-        track: names of trackers that get the metrics too: "tensorboard", "wandb".
+        track: names of trackers that get the metrics too: "tensorboard", "wandb", "mlflow".
         check: take a short look, of 2 s, at a task that is not built in; a note tells what it found.
 
     Raises:

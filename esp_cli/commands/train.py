@@ -81,7 +81,9 @@ def train(
     ] = None,
     track: Annotated[
         list[str] | None,
-        Option("--track", help="Also send metrics to tensorboard or wandb, offline in the run folder; repeatable."),
+        Option(
+            "--track", help="Also send metrics to tensorboard, wandb or mlflow, offline in the run folder; repeatable."
+        ),
     ] = None,
     watch: Annotated[
         bool,

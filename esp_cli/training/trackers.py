@@ -6,6 +6,7 @@ import contextlib
 import os
 import secrets
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -13,6 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Protocol
 
+from esp_cli.files.documents import flat
 from esp_cli.files.opening import own_folder
 from esp_cli.files.writing import replace_file
 from esp_envs.errors import UserError
@@ -76,10 +78,6 @@ class WeightsAndBiases:
         self._seeds = run.seeds
         folder = run.folder.absolute()
         store = own_folder(folder / "wandb")
-        known = store / "run-id"  # one run for wandb, however often it is resumed
-        if not known.is_file():
-            store.mkdir(exist_ok=True)
-            replace_file(known, secrets.token_hex(4).encode())
         os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
         mode: Any = os.environ.get("WANDB_MODE", "offline")
         off = ("disable_git", "disable_code", "disable_job_creation", "x_disable_stats", "x_disable_meta")
@@ -91,7 +89,7 @@ class WeightsAndBiases:
             self._run = wandb.init(
                 project=os.environ.get("WANDB_PROJECT", "esp"),
                 name=folder.name,
-                id=known.read_text(encoding="utf-8").strip(),
+                id=recorded(store / "run-id", lambda: secrets.token_hex(4)),
                 resume="allow",
                 dir=str(folder),
                 mode=mode,
@@ -103,13 +101,51 @@ class WeightsAndBiases:
         self._run.define_metric("*", step_metric="step")
 
     def write(self, step: int, values: Row) -> None:
-        found = scalars(values, self._seeds)
-        named = {name if seed is None else f"seed-{seed}/{name}": value for name, seed, value in found}
-        self._run.log({"step": step, **named})
+        self._run.log({"step": step, **named(values, self._seeds)})
 
     def close(self) -> None:
         with self._places:
             self._run.finish()
+
+
+class MlFlow:
+    """MLflow in `mlruns/`, a file store, unless MLFLOW_TRACKING_URI says otherwise; one run of the experiment "esp"."""
+
+    def __init__(self, run: TrackedRun) -> None:
+        # read when mlflow is imported or a store is opened; what the user has set stays
+        quiet = {"MLFLOW_DISABLE_TELEMETRY": "true", "MLFLOW_ALLOW_FILE_STORE": "true"}
+        # a server that does not answer ends the tracking within seconds, not minutes
+        brief = {"MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1", "MLFLOW_HTTP_REQUEST_TIMEOUT": "10"}
+        for name, value in (quiet | brief).items():
+            os.environ.setdefault(name, value)
+        from mlflow.entities import Metric, Param  # noqa: PLC0415 - reads the environment
+        from mlflow.tracking import MlflowClient  # noqa: PLC0415
+
+        folder = run.folder.absolute()
+        store = own_folder(folder / "mlruns")
+        self._seeds, self._metric = run.seeds, Metric
+        self._client = MlflowClient(os.environ.get("MLFLOW_TRACKING_URI") or store.as_uri())
+        found = self._client.get_experiment_by_name("esp")
+        experiment = found.experiment_id if found is not None else self._client.create_experiment("esp")
+
+        def begin() -> str:
+            run_id = self._client.create_run(experiment, run_name=folder.name).info.run_id
+            params = [Param(name, str(value)[:500]) for name, value in flat(run.config)]
+            for first in range(0, len(params), 100):  # as many as one request takes
+                self._client.log_batch(run_id, params=params[first : first + 100])
+            return str(run_id)
+
+        self._run_id = recorded(store / "run-id", begin)
+        self._client.update_run(self._run_id, status="RUNNING")
+
+    def write(self, step: int, values: Row) -> None:
+        now_ms = int(time.time() * 1000)
+        metrics = [self._metric(name, value, now_ms, step) for name, value in named(values, self._seeds).items()]
+        for first in range(0, len(metrics), 1000):
+            self._client.log_batch(self._run_id, metrics=metrics[first : first + 1000])
+
+    def close(self) -> None:
+        self._client.set_terminated(self._run_id)
 
 
 class Tracker(Protocol):
@@ -120,7 +156,11 @@ class Tracker(Protocol):
     def close(self) -> None: ...
 
 
-TRACKERS: dict[str, Callable[[TrackedRun], Tracker]] = {"tensorboard": TensorBoard, "wandb": WeightsAndBiases}
+TRACKERS: dict[str, Callable[[TrackedRun], Tracker]] = {
+    "tensorboard": TensorBoard,
+    "wandb": WeightsAndBiases,
+    "mlflow": MlFlow,
+}
 """The trackers by name, which is that of their package and of the extra that installs it."""
 
 
@@ -165,6 +205,7 @@ def require(names: Sequence[str]) -> None:
 
 def open_trackers(names: Sequence[str], run: TrackedRun, tell: Callable[[str], None]) -> list[Guarded]:
     """Open trackers for a run; one that cannot be opened is told and left out."""
+    require(names)
     return [Guarded(name, partial(TRACKERS[name], run), tell) for name in dict.fromkeys(names)]
 
 
@@ -180,3 +221,17 @@ def scalars(values: Row, seeds: tuple[int, ...]) -> Iterator[tuple[str, int | No
         yield name, None, sum(numbers) / len(numbers)
         if len(numbers) == len(seeds) > 1:
             yield from ((name, seed, number) for seed, number in zip(seeds, numbers, strict=True))
+
+
+def named(values: Row, seeds: tuple[int, ...]) -> dict[str, float]:
+    """Return the means of a row under their names, and each seed's number under seed-k/NAME."""
+    return {n if seed is None else f"seed-{seed}/{n}": value for n, seed, value in scalars(values, seeds)}
+
+
+def recorded(file: Path, make: Callable[[], str]) -> str:
+    """Return the id of a tracked run that a run folder records; made and recorded where it has none."""
+    if not file.is_file():
+        known = make()
+        file.parent.mkdir(exist_ok=True)
+        replace_file(file, known.encode())
+    return file.read_text(encoding="utf-8").strip()

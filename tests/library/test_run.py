@@ -73,6 +73,18 @@ def test_a_stopped_seed_and_a_number_that_was_not_measured_are_nan() -> None:
         _ = metrics["c"]
 
 
+def test_metrics_become_a_table(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    pandas = pytest.importorskip("pandas", reason="needs pandas")
+    table = run.metrics.to_pandas()
+    assert list(table.index) == run.metrics.steps.tolist()
+    assert np.array_equal(table["train/return", 7], run.metrics["train/return"][:, 1], equal_nan=True)
+    assert ("time/elapsed_s", "run") in table.columns
+    assert isinstance(table, pandas.DataFrame)
+    monkeypatch.setitem(__import__("sys").modules, "pandas", None)
+    with pytest.raises(ValueError, match="to_pandas needs pandas, which is not installed"):
+        run.metrics.to_pandas()
+
+
 def test_a_listener_stops_a_run_and_training_goes_on_bit_for_bit(run: Run, tmp_path: Path) -> None:
     told: list[Progress] = []
 

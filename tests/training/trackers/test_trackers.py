@@ -73,12 +73,12 @@ def test_a_tracker_that_fails_is_one_line_and_the_run_goes_on(finished, tmp_path
 
 def test_a_missing_package_is_one_sentence_before_there_is_a_folder(tmp_path, monkeypatch, copied):
     monkeypatch.setattr(trackers, "find_spec", lambda name: None)
-    sentence = "wandb is not installed: pip install 'wandb>=0.18', or leave out --track wandb"
-    assert refused("train", "--out", tmp_path / "run", "--track", "wandb") == sentence
+    sentence = "mlflow is not installed: pip install 'mlflow-skinny>=2.16', or leave out --track mlflow"
+    assert refused("train", "--out", tmp_path / "run", "--track", "mlflow") == sentence
     assert not (tmp_path / "run").exists()
-    assert refused("train", "--resume", copied, "--track", "wandb") == sentence
+    assert refused("train", "--resume", copied, "--track", "mlflow") == sentence
     assert "there is no tracker 'comet'; the trackers are" in refused("train", "--track", "comet")
-    with pytest.raises(ValueError, match="there is no tracker 'comet'; the trackers are tensorboard, wandb"):
+    with pytest.raises(ValueError, match="there is no tracker 'comet'; the trackers are tensorboard, wandb, mlflow"):
         trackers.require(["comet"])
 
 
@@ -144,7 +144,17 @@ def _log_records(content: bytes, first_block: int = 32768 - 7) -> Iterator[bytes
             parts = b""
 
 
-READERS = {"tensorboard": of_tensorboard, "wandb": of_wandb}
+def of_mlflow(run: Path) -> Curves:
+    os.environ["MLFLOW_ALLOW_FILE_STORE"] = "true"
+    from mlflow.tracking import MlflowClient
+
+    client = MlflowClient((run / "mlruns").as_uri())
+    run_id = (run / "mlruns" / "run-id").read_text()
+    names = client.get_run(run_id).data.metrics
+    return {name: [(one.step, one.value) for one in client.get_metric_history(run_id, name)] for name in names}
+
+
+READERS = {"tensorboard": of_tensorboard, "wandb": of_wandb, "mlflow": of_mlflow}
 
 
 @pytest.mark.parametrize("name", READERS)
@@ -155,7 +165,7 @@ def test_a_real_tracker_holds_what_the_metrics_file_holds_and_writes_nowhere_els
     home.mkdir()
     work.mkdir()
     command = ["train", *TINY_OPTIONS, *STEPS, "--seeds", "3,7", "--track", name, "--out", "run"]
-    environment = {key: value for key, value in os.environ.items() if not key.startswith(("WANDB", "XDG"))}
+    environment = {key: value for key, value in os.environ.items() if not key.startswith(("WANDB", "MLFLOW", "XDG"))}
     environment |= {"HOME": str(home), "PYTHONDONTWRITEBYTECODE": "1"}
     environment["PYTHONPATH"] = os.pathsep.join(
         [str(ROOT), str(ROOT / "environments"), os.environ.get("PYTHONPATH", "")]
@@ -178,19 +188,21 @@ def test_a_real_tracker_holds_what_the_metrics_file_holds_and_writes_nowhere_els
     assert set(found) >= {"train/return", "time/steps_per_second"}
 
 
-def test_a_resumed_run_is_one_run_for_its_tracker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("wandb")
+@pytest.mark.parametrize("name", ["wandb", "mlflow"])
+def test_a_resumed_run_is_one_run_for_its_tracker(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not trackers.find_spec(name):
+        pytest.skip(f"{name} is not installed; .ci/run installs it")
     monkeypatch.setenv("HOME", str(tmp_path))
-    run = train_tiny(tmp_path / "run", "--seeds", "3,7", "--track", "wandb", steps=100)
-    file = run / "wandb" / "run-id"
+    run = train_tiny(tmp_path / "run", "--seeds", "3,7", "--track", name, steps=100)
+    file = run / ("wandb" if name == "wandb" else "mlruns") / "run-id"
     known = file.read_text()
     for checkpoint in (run / "checkpoints").iterdir():
         checkpoint.unlink()
     (run / "policy.safetensors").unlink()
-    told = esp("train", "--resume", run, "--track", "wandb")
+    told = esp("train", "--resume", run, "--track", name)
     assert "tracking with" not in told.stderr
     assert file.read_text() == known
-    curves = of_wandb(run)
+    curves = READERS[name](run)
     assert [step for step, _ in curves[NAME]] in ([0, 100, 0, 100], [0, 0, 100, 100])
     assert not {name for name in os.environ if name.endswith("_DIR") and name.startswith("WANDB_")}, (
         "the next run's own"
