@@ -88,7 +88,7 @@ def settings() -> str:
                 f"`{s.name}`",
                 _written(s.default),
                 _elsewhere(s),
-                s.bounds,
+                " ".join(filter(None, (s.bounds, s.unit))),
                 s.description,
             )
             for s in section.settings

@@ -48,20 +48,21 @@ def check_paired(
     slow: bool = False,
     watch: Watch = lambda *_: None,
     until: float = math.inf,
+    spare: float = math.inf,
 ) -> list[ElementVerdict]:
     """Judge elements on a task that can be set to a state; of a `slow` simulator in fewer worlds and steps.
 
     Of many elements, each is first tried in an eighth of the states: what is broken there is broken. What holds in all
     states that were visited is tried further out, too, where random play does not go: an element that is broken there
     is not covered. And it is tried in the steps that follow, in which clocks run and what no state holds builds up.
-    `until` as in `verdicts_of`.
+    `until` and `spare` as in `verdicts_of`.
     """
     shown = make(1, [0]).spec
     most = _FEWEST_WORLDS if slow else _MOST_WORLDS
     worlds = max(_FEWEST_WORLDS, min(most, _NUMBERS // (shown.num_agents * shown.observation.width)))
     visited = visit(make(worlds, [0]), watch, (until + time.monotonic()) / 2, early=slow)
     judge = _Judge(make, shown, visited, slow, until, len(elements) > _SOME)
-    return verdicts_of(elements, judge, lambda element: is_declared(element, shown), watch, until)
+    return verdicts_of(elements, judge, lambda element: is_declared(element, shown), watch, until, spare)
 
 
 class _Judge:

@@ -67,21 +67,22 @@ def check_symmetry(
     from_transitions: bool = False,
     watch: Watch = lambda *_: None,
     seconds: float = math.inf,
+    spare: float = math.inf,
 ) -> SymmetryReport:
     """Judge for each element and field whether a task is symmetric.
 
     Elements are those of `--transforms`, or "shift"; by default those of `candidates`, and a shift where the task
     declares that it changes nothing. `watch` is told of how many steps of how many are collected, then of elements.
-    After `seconds` the elements that are left are not covered; declared ones are tried first. No more than half of the
-    time that is left goes to collecting.
+    After `seconds` the elements that are left are not covered; declared ones are tried first, and after `spare` seconds
+    no others. No more than half of the time that is left goes to collecting.
     """
-    until = time.monotonic() + seconds
+    until, spare = time.monotonic() + seconds, time.monotonic() + spare
     spec = make(1, [0]).spec
     if spec.roles:
         raise UserError(f"{spec.name} has roles; 'esp check symmetry' judges each role by itself")
     elements = [] if transforms == SHIFT else candidates(spec, transforms)
     shifts = [Shift(spec)] if transforms == SHIFT or (transforms is None and spec.shifts) else []
-    method, verdicts = judged(make, [*elements, *shifts], from_transitions, watch, until)
+    method, verdicts = judged(make, [*elements, *shifts], from_transitions, watch, until, spare)
     return _reported(spec.name, method, spec, elements, verdicts, transforms)
 
 
@@ -105,6 +106,7 @@ def judged(
     from_transitions: bool = False,
     watch: Watch = lambda *_: None,
     until: float = math.inf,
+    spare: float = math.inf,
 ) -> tuple[str, list[ElementVerdict]]:
     """Return the method that a task allows, and what it says of elements until time is over; a shift comes last."""
     probe = make(1, [0])
@@ -122,11 +124,11 @@ def judged(
         return env
 
     carried = [element for element in elements if _is_carried(element, probe.spec)]
-    by_pairs = paired.check_paired(settable, carried, not native, watch, until)
+    by_pairs = paired.check_paired(settable, carried, not native, watch, until, spare)
     verdicts = dict(zip(carried, by_pairs, strict=True))
     if rest := [element for element in elements if element not in verdicts]:  # items that the simulator does not name
         everybody = probe.inner.spec if isinstance(probe, RoleView) else probe.spec
-        for element, found in zip(rest, judged(make, rest, True, watch, until)[1], strict=True):
+        for element, found in zip(rest, judged(make, rest, True, watch, min(until, spare))[1], strict=True):
             # what others see may say what a colour or word means
             unseen = everybody.num_agents > 1 and found.outcome == "holds"
             verdicts[element] = replace(found, fields=(), reason=_SEVERAL) if unseen else found

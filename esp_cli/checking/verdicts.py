@@ -90,15 +90,16 @@ def verdicts_of(
     is_declared: Callable[[Named], bool],
     watch: Watch = lambda *_: None,
     until: float = math.inf,
+    spare: float = math.inf,
 ) -> list[ElementVerdict]:
     """Judge elements, declared ones first, and tell how many of how many are done.
 
-    At `until` of `time.monotonic` the rest is not tried and so not covered.
+    At `until` of `time.monotonic` the rest is not tried and so not covered, at `spare` what nobody declared.
     """
     found = dict[Named, ElementVerdict]()
     for done, element in enumerate(sorted(elements, key=lambda one: not is_declared(one)), 1):
         try:
-            stop_at(until)
+            stop_at(until if is_declared(element) else min(until, spare))
             found[element] = judge(element)
         except Late:
             found[element] = ElementVerdict(element.name, is_declared(element), (), LATE)

@@ -154,10 +154,9 @@ def _check_roles(
         if asked == "":
             continue
         with console.watching("check", "elements") as watch:
-            share = (until - time.monotonic()) / left
-            reports[role.name] = check_symmetry(
-                worlds_of_role(make_worlds, role.name), asked, watch=watch, seconds=share
-            )
+            make = worlds_of_role(make_worlds, role.name)
+            rest = until - time.monotonic()
+            reports[role.name] = check_symmetry(make, asked, watch=watch, seconds=rest, spare=rest / (2 * left - 1))
 
     def show() -> None:
         for report in reports.values():

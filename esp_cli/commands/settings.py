@@ -1,4 +1,4 @@
-"""`esp settings`: every setting with its default, its bounds and what it does."""
+"""`esp settings`: every setting with its default, its bounds, its unit and what it does."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def settings(
     ] = None,
     json: JsonOption = None,
 ) -> None:
-    """List the settings that --set and --config change: default, values and meaning."""
+    """List the settings that --set and --config change: default, values, unit and meaning."""
     found = _sections(of)
     console.result(json, found, lambda: _print(found))
 
@@ -66,10 +66,10 @@ def _print_section(section: Section) -> None:
     option = {"task": "--task", "algorithm": "--algo", "network": "--network"}.get(section.kind)
     title = f"{section.name}: --set {prefix}.NAME=VALUE" + (f", with {option} {section.name}" if option else "")
     rows = [
-        (one.name.rpartition(".")[2], _written(one.default), one.bounds or one.type, _meaning(one))
+        (one.name.rpartition(".")[2], _written(one.default), one.bounds or one.type, one.unit, _meaning(one))
         for one in section.settings
     ]
-    console.table(("setting", "default", "values", "meaning"), rows, title=title)
+    console.table(("setting", "default", "values", "unit", "meaning"), rows, title=title)
 
 
 def _meaning(setting: Setting) -> str:

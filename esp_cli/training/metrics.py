@@ -15,7 +15,7 @@ import math
 import os
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,9 @@ from esp_cli.files.opening import open_own, open_regular
 from esp_cli.files.writing import MAX_LINE_BYTES, TAIL_BYTES, replacing, write_all
 from esp_cli.training.trackers import Guarded
 from esp_envs.errors import UserError
+
+if TYPE_CHECKING:
+    import pandas
 
 Floats = NDArray[np.float64]
 Value = float | None | list[float | None] | Tensor
@@ -146,11 +149,13 @@ class Metrics(Shown, dict[str, Floats]):
     def __init__(self, rows: Sequence[Mapping[str, Any]], seeds: Sequence[int]) -> None:
         self.seeds = tuple(seeds)
         self.steps: NDArray[np.int64] = np.array([row["step"] for row in rows], dtype=np.int64)
+        self._whole: set[str] = set()
         for index, row in enumerate(rows):
             for name, value in row.items():
                 if name == "step":
                     continue
                 columns = len(self.seeds) if isinstance(value, list) else 1
+                self._whole |= set() if isinstance(value, list) else {name}
                 array = self.setdefault(name, np.full((len(rows), columns), math.nan))
                 array[index] = np.array(value, dtype=np.float64)
 
@@ -162,6 +167,25 @@ class Metrics(Shown, dict[str, Floats]):
             f"{len(self.steps)} of {len(self)} names, steps {self.steps.min(initial=0)} to {self.steps.max(initial=0)}"
         )
         return {"rows": what, "seeds": ", ".join(map(str, self.seeds)), **newest}
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return a table indexed by steps, with columns (metric, seed); "run" stands for what the run has as a whole.
+
+        Raises:
+            UserError: pandas is not installed.
+        """
+        try:
+            import pandas as pd  # noqa: PLC0415 - not a dependency
+        except ImportError:
+            raise UserError("to_pandas needs pandas, which is not installed: pip install pandas") from None
+        columns = {
+            (name, seed): array[:, column]
+            for name, array in self.items()
+            for column, seed in enumerate(("run",) if name in self._whole else self.seeds)
+        }
+        table = pd.DataFrame(columns, index=pd.Index(self.steps, name="step"))
+        table.columns = table.columns.set_names(["metric", "seed"])
+        return table
 
 
 def elapsed_s(row: Mapping[str, Any]) -> float:

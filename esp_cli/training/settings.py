@@ -21,6 +21,22 @@ from esp_envs.errors import UserError
 from esp_envs.installed import Registry
 from esp_envs.registry import TASKS, task_class
 
+_UNITS = {
+    "_m": "m",
+    "_s": "s",
+    "_rad": "rad",
+    "_steps": "steps",
+    "_horizon": "steps",
+    "_truncation": "steps",
+    "_action_delay": "steps",
+    "_episodes": "episodes",
+    "_num_epochs": "epochs",
+    "_num_envs": "worlds",
+    "_num_agents": "agents",
+    "_landmark_extent": "length",
+}
+"""Units by the ending of a setting's name; a field may name another one as `json_schema_extra={"unit": ...}`."""
+
 Kind = Literal["algorithm", "task", "network", "prior", "evaluation"]
 
 
@@ -32,6 +48,7 @@ class Setting:
     type: str  # "integer", "number", "text", "flag", or "list of ..."
     default: Any  # where neither preset, task, file nor command line says something else
     bounds: str  # of its values in words: "from 1", "above 0 to 1", "relu, tanh"; empty for none
+    unit: str  # of its value; empty for a bare number
     description: str
     presets: Mapping[str, Any]  # values that a preset sets instead; "fast on navigation" on this task alone
     tasks: Mapping[str, Any]  # values that the preset default sets on a task instead
@@ -88,6 +105,7 @@ def _settings(section: str, model: type[BaseModel]) -> tuple[Setting, ...]:
             type=_type(schema[name]),
             default=schema[name].get("default"),
             bounds=_bounds(schema[name]),
+            unit=str(schema[name].get("unit", "")) or next((_UNITS[e] for e in _UNITS if f"_{name}".endswith(e)), ""),
             description=field.description or "",
             presets=_changes(section, name, PRESETS)
             | _changes(section, name, FAST, "fast on ")

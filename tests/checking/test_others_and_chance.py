@@ -8,6 +8,7 @@ import torch
 from esp_cli.checking import check_symmetry
 from esp_cli.checking.comparison import by_distances
 from esp_cli.checking.stepping import outcomes, visit
+from esp_cli.checking.verdicts import LATE, ElementVerdict, verdicts_of
 from esp_cli.symmetry import build_transform, parse_elements
 from esp_envs import BatchedTask, Field, Kind, generators_for, layout, make, register
 from esp_envs.base import Step
@@ -153,6 +154,13 @@ def test_the_same_chance_proves_what_holds_and_refuses_nothing(cls, outcome: str
     reward = next(field for field in found.fields if field.field == "reward")
     assert (found.outcome, reward.outcome) == (outcome, outcome)
     assert (reward.share == 0) == (cls is Noisy)
+
+
+def test_what_nobody_declared_ends_first() -> None:
+    elements = parse_elements("rot90,flip-x", 1)
+    judge = lambda element: ElementVerdict(element.name, False, ())  # noqa: E731
+    found = verdicts_of(elements, judge, lambda element: element.name == "flip-x", spare=0.0)
+    assert [one.reason for one in found] == [LATE, ""]
 
 
 def test_half_of_the_worlds_follows_the_heuristic(monkeypatch: pytest.MonkeyPatch) -> None:

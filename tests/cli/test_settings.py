@@ -32,18 +32,19 @@ def test_every_default_is_what_a_run_has_without_a_preset_and_can_be_set(section
         assert stored[key][one.name.partition(".")[2]] == decided, one.name
 
 
-def test_bounds_presets_and_tasks_are_told() -> None:
+def test_bounds_units_presets_and_tasks_are_told() -> None:
     found = {
         one.name: one for section in SECTIONS for one in section.settings if section.name in ("mappo", "formation")
     }
     rates = {"fast on navigation": 4e-3, "fast on predator-prey": 4e-3}
     rate, envs, arena = found["mappo.learning_rate"], found["mappo.num_envs"], found["task.arena_m"]
     assert (rate.type, rate.bounds, rate.presets) == ("number", "above 0", {"paper": 7e-4} | rates)
-    assert (envs.bounds, envs.tasks) == (
+    assert (envs.bounds, envs.unit, envs.tasks) == (
         "from 1",
+        "worlds",
         {"formation": 8, "wildlife": 64, "quadruped": 256, "sets on navigation": 128},
     )
-    assert arena.bounds == "above 0 to 20"
+    assert (arena.bounds, arena.unit) == ("above 0 to 20", "m")
     assert found["mappo.critic_input"].bounds == "state, observations, own"
 
 
@@ -70,7 +71,7 @@ def test_a_task_of_ones_own_has_settings_too(tmp_path: Path, monkeypatch: pytest
     monkeypatch.chdir(tmp_path)
     (section,) = json.loads(esp("settings", "wide:Wide", "--json", "-").stdout)
     (slope,) = [one for one in section["settings"] if one["name"] == "task.slope_rad"]
-    assert (slope["default"], slope["bounds"]) == (0.5, "from 0")
+    assert (slope["default"], slope["unit"], slope["bounds"]) == (0.5, "rad", "from 0")
     assert section_of("task", "wide:Wide").kind == "task"
 
 
