@@ -11,7 +11,7 @@ from esp_cli.policies.bundled import MANIFEST, MANIFEST_FORMAT, Entry, Score, bu
 from esp_cli.policies.evaluation import best_seed, evaluate
 from esp_cli.policies.loading import TrainedPolicy, open_policy
 from esp_cli.policies.statistics import normalised
-from esp_cli.training.checkpoint import describe_policy, write_policy
+from esp_cli.training.checkpoint import POLICY_FORMAT, describe_policy, save_checkpoint
 
 
 def bundle(trained: TrainedPolicy, name: str, folder: Path, episodes: int = EPISODES) -> Entry:
@@ -24,7 +24,8 @@ def bundle(trained: TrainedPolicy, name: str, folder: Path, episodes: int = EPIS
     scaled = normalised(score.mean, found.anchors)
     file = folder / f"{name}.safetensors"
     folder.mkdir(parents=True, exist_ok=True)
-    write_policy(file, own.policy.state_dict(), describe_policy(own.config, own.spec, own.step, [score.mean]))
+    described = describe_policy(own.config, own.spec, own.step, [score.mean])
+    save_checkpoint(file, own.policy.state_dict(), described, POLICY_FORMAT)
     entry = Entry(
         name=name,
         file=file.name,

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import torch
@@ -110,19 +112,16 @@ def _elements(text: str, num_agents: int) -> tuple[Element, ...]:
     elements = tuple(element for element in elements if not element.is_identity)
     if len(elements) <= _MOST:
         return elements
-    chosen: list[Element] = []
-    generating = dict[frozenset[Any], list[Element]]()  # by what they act on
-    reached: set[Element] = set()
+    chosen, reached = list[Element](), set[Element]()
+    generating = defaultdict[frozenset[Any], list[Element]](list)  # by what they act on
     for element in elements:
         if element in reached or all(element.restricted(frozenset([aspect])) in reached for aspect in element.aspects):
             continue
         chosen.append(element)
-        alike = generating.setdefault(element.aspects, [])
-        try:
-            reached.update(FiniteGroup.generated_by(element.name, [*alike, element]).elements)
-        except ValueError:  # its products are too many to list, so it stands for itself
-            continue
-        alike.append(element)
+        alike = [*generating[element.aspects], element]
+        with suppress(ValueError):  # its products are too many to list, so it stands for itself
+            reached.update(FiniteGroup.generated_by(element.name, alike).elements)
+            generating[element.aspects] = alike
     return tuple(chosen)
 
 
@@ -150,7 +149,7 @@ def _scene(accepted: Sequence[Element], tried: Sequence[Element], scene: str) ->
     if held.issuperset(turns) and any(seen[e].turn.denominator > _MOST_CORNERS for e in turns):
         name = "o2" if mirrors and held.issuperset(mirrors) else "so2"
         return name, name
-    groups = _polygon_groups([e for e, plane in seen.items() if plane.turn.denominator <= _MOST_CORNERS])
+    groups = _polygon_groups({e: plane for e, plane in seen.items() if plane.turn.denominator <= _MOST_CORNERS})
     if scene and "*" not in scene and not any(_is_planar(e) for e in _listed(scene)):
         groups.append((scene, _listed(scene)))
     best, text, size = "c1", "", 1
@@ -165,15 +164,11 @@ def _is_planar(element: Element) -> bool:
     return all(isinstance(part, PlaneElement) for part in element.geometry)
 
 
-def _polygon_groups(tried: Sequence[Element]) -> list[tuple[str, tuple[Element, ...]]]:
+def _polygon_groups(tried: Mapping[Element, PlaneElement]) -> list[tuple[str, tuple[Element, ...]]]:
     """Return the cyclic and dihedral groups that hold some of the tried elements, by name, without the identity."""
-    mirrored = [PlaneElement.of(e).mirrored for e in tried]
-    turns = (PlaneElement.of(e).turn for e, is_mirror in zip(tried, mirrored, strict=True) if not is_mirror)
-    folds = sorted({turn.denominator for turn in turns})
-    axes = [e for e, is_mirror in zip(tried, mirrored, strict=True) if is_mirror]
-    found: list[tuple[str, tuple[Element, ...]]] = [(axis.name, (axis,)) for axis in axes] + [
-        (f"c{fold}", _listed(f"c{fold}")) for fold in folds
-    ]
+    folds = sorted({plane.turn.denominator for plane in tried.values() if not plane.mirrored})
+    axes = [e for e, plane in tried.items() if plane.mirrored]
+    found = [(axis.name, (axis,)) for axis in axes] + [(f"c{fold}", _listed(f"c{fold}")) for fold in folds]
     for axis in axes:
         for fold in folds:
             turned = _listed(f"c{fold}")
@@ -223,8 +218,7 @@ def _listed(text: str) -> tuple[Element, ...]:
 
 def _is_readable(text: str, accepted: Sequence[Element]) -> bool:
     """Return whether `--transforms` takes a text; it takes no list that holds a sampled group."""
-    try:
+    with suppress(ValueError):
         parse_elements(text, max((len(e.permutation or ()) for e in accepted), default=1))
-    except ValueError:
-        return False
-    return True
+        return True
+    return False

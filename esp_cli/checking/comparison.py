@@ -17,17 +17,18 @@ a proof. And where a run from the images that meets the chance of X gives X itse
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from esp_cli.checking.shifting import Shift
-from esp_cli.checking.verdicts import NEGLIGIBLE, RANK, SIGNIFICANT, FieldVerdict, chance, concluded
+from esp_cli.checking.shifting import Unmoved
+from esp_cli.checking.verdicts import NEGLIGIBLE, RANK, SIGNIFICANT, FieldVerdict, concluded
 from esp_cli.symmetry import Transform
 from esp_envs.base import Observation, Step
-from esp_envs.spec import Layout, TaskSpec
+from esp_envs.spec import TaskSpec
 
 TOLERATED = 0.15  # standard deviations that a field with chance may be off, where it is not found broken
 FEW = 0.05
@@ -105,8 +106,8 @@ def by_distances(name: str, x: Tensor, x2: Tensor, y: Tensor, y2: Tensor) -> Fie
     broken = (gaps > SIGNIFICANT * errors) & (gaps > NEGLIGIBLE)
     worst = int(torch.where(broken, gaps, gaps * (not broken.any())).argmax())
     gap, error = float(gaps[worst]), float(errors[worst])
-    chances = (chance(float(gap), TOLERATED, float(error)) for gap, error in zip(gaps, errors, strict=True))
-    return concluded(name, gap, error, bool(broken.any()), max(chances))
+    chances = torch.special.ndtr((gaps - TOLERATED) / errors.clamp_min(1e-12))
+    return concluded(name, gap, error, bool(broken.any()), float(chances.max()))
 
 
 def _known(*sides: Tensor) -> tuple[list[Tensor], Tensor]:
@@ -147,37 +148,33 @@ def merged(verdicts: Sequence[FieldVerdict]) -> list[FieldVerdict]:
     """Keep one verdict for each field: the start's and the reached observation are of one field."""
     best: dict[str, FieldVerdict] = {}
     for verdict in verdicts:
-        name = verdict.field.removeprefix("start ")
-        renamed = replace(verdict, field=name)
-        known = best.get(name)
-        if known is None or (RANK[renamed.outcome], renamed.gap) > (RANK[known.outcome], known.gap):
-            best[name] = renamed
+        renamed = replace(verdict, field=verdict.field.removeprefix("start "))
+        known = best.setdefault(renamed.field, renamed)
+        best[renamed.field] = max(known, renamed, key=lambda v: (RANK[v.outcome], v.gap))
     return list(best.values())
 
 
-def by_field(steps: Sequence[Step], spec: TaskSpec, transform: Transform | Shift | None) -> Outcomes:
+def by_field(steps: Sequence[Step], spec: TaskSpec, transform: Transform | Unmoved) -> Outcomes:
     """Return everything that the steps gave by field, transformed."""
-    parts: dict[str, list[Tensor]] = {}
+    parts = defaultdict[str, list[Tensor]](list)
 
-    def add(prefix: str, layout: Layout, rows: Tensor) -> None:
-        for name, where in layout.slices().items():
-            parts.setdefault(prefix + name, []).append(rows[..., where].flatten(0, 1).flatten(1))
+    def add(name: str, rows: Tensor) -> None:
+        parts[name].append(rows.float().flatten(0, 1).flatten(1))
 
     for step in steps:
         for prefix, seen in (("start ", step.next), ("", step.final)):
             assert isinstance(seen, Observation)
             if prefix and not bool(seen.obs.isfinite().any()):
                 continue  # a simulator of others does not say what is seen before a step
-            add(f"{prefix}obs.", spec.observation, seen.obs if transform is None else transform.obs(seen.obs))
-            if not spec.is_joint:
-                add(f"{prefix}state.", spec.state, seen.state if transform is None else transform.state(seen.state))
+            rows = [("obs", spec.observation, transform.obs(seen.obs))]
+            rows += [] if spec.is_joint else [("state", spec.state, transform.state(seen.state))]
+            for what, layout, row in rows:
+                for name, where in layout.slices().items():
+                    add(f"{prefix}{what}.{name}", row[..., where])
             if seen.action_mask is not None:
-                mask = seen.action_mask if transform is None else transform.push_outputs(seen.action_mask)
-                parts.setdefault(f"{prefix}action mask", []).append(mask.float().flatten(0, 1).flatten(1))
+                add(f"{prefix}action mask", transform.push_outputs(seen.action_mask))
             if seen.alive is not None:
-                alive = seen.alive if transform is None else transform.per_agent(seen.alive)
-                parts.setdefault(f"{prefix}alive", []).append(alive.float().flatten(0, 1))
-        reward = step.reward if transform is None else transform.per_agent(step.reward)
-        parts.setdefault("reward", []).append(reward.flatten(0, 1))
-        parts.setdefault("end", []).append(step.terminated.float().flatten(0, 1).unsqueeze(-1))
+                add(f"{prefix}alive", transform.per_agent(seen.alive))
+        add("reward", transform.per_agent(step.reward))
+        add("end", step.terminated.unsqueeze(-1))
     return {name: torch.cat(rows) for name, rows in parts.items()}

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 
 from esp_cli.checking.task import TRANSITIONS, check_symmetry, judged
@@ -15,6 +13,7 @@ from esp_cli.symmetry.admission import DISCOVERED, admitted_elements, unrestrict
 from esp_cli.training.config import RunConfig
 from esp_envs.base import Environment, generators_for
 from esp_envs.errors import UserError
+from esp_envs.promises import MakeWorlds
 from esp_envs.registry import task_class
 from esp_envs.roles import without_agents
 from esp_envs.views import worlds_of_role
@@ -36,12 +35,12 @@ def prepared(config: RunConfig) -> RunConfig:
             f"with prior.compass nothing is false that prior.trust={prior.trust} could find; leave one of the two out"
         )
     if prior.transforms == DISCOVERED.rstrip(":"):
-        found = _discovered(_Maker.of(config))
+        found = _discovered(_of(config))
         if prior.copies == "all" or prior.trust != "full":
             found = _listed(found, config)
         prior = prior.model_copy(update={"transforms": DISCOVERED + found} | ({} if found else {"kind": "none"}))
     if prior.kind != "none" and prior.trust != "full" and not prior.weights:
-        gaps = _breaking(_Maker.of(config), prior.transforms)
+        gaps = _breaking(_of(config), prior.transforms)
         weights = {name: math.exp(-prior.doubt * gap) if gap < math.inf else 0.0 for name, gap in gaps}
         prior = prior.model_copy(update={"weights": weights})
     return config if prior is config.prior else config.model_copy(update={"prior": prior})
@@ -58,36 +57,34 @@ def _effective(config: RunConfig) -> RunConfig:
 
 def _listed(transforms: str, config: RunConfig) -> str:
     """Leave factors out from the right, orders of items first, until all elements can be listed."""
-    num_agents = _Maker.of(config)(1, [0]).spec.num_agents
+    num_agents = _maker(_of(config))(1, [0]).spec.num_agents
     while "*" in transforms and isinstance(parse_elements(transforms, num_agents), Group):
         transforms = transforms.rpartition("*")[0]
     return transforms
 
 
-@dataclass(frozen=True)
-class _Maker:
-    """Makes the worlds of a task; equal for equal ones, so that nothing is measured twice."""
+_Task = tuple[type[Environment], str]  # a class and its settings as JSON: equal for equal ones
 
-    task: type[Environment]
-    settings: str  # as JSON
 
-    @classmethod
-    def of(cls, config: RunConfig) -> _Maker:
-        return cls(task_class(config.task), json.dumps(config.task_settings, sort_keys=True))
+def _of(config: RunConfig) -> _Task:
+    return task_class(config.task), json.dumps(config.task_settings, sort_keys=True)
 
-    def __call__(self, num_envs: int, seeds: Sequence[int]) -> Environment:
-        return self.task(self.task.Settings(**json.loads(self.settings)), num_envs, generators_for(seeds))
+
+def _maker(task: _Task) -> MakeWorlds:
+    cls, settings = task[0], task[0].Settings(**json.loads(task[1]))
+    return lambda num_envs, seeds: cls(settings, num_envs, generators_for(seeds))
 
 
 @lru_cache(maxsize=64)
-def _discovered(make_worlds: _Maker) -> str:
-    return check_symmetry(make_worlds).transforms.removeprefix(DISCOVERED)
+def _discovered(task: _Task) -> str:
+    return check_symmetry(_maker(task)).transforms.removeprefix(DISCOVERED)
 
 
 @lru_cache(maxsize=64)
-def _breaking(make_worlds: _Maker, transforms: str) -> tuple[tuple[str, float], ...]:
+def _breaking(task: _Task, transforms: str) -> tuple[tuple[str, float], ...]:
     """Return by how many deviations each element's worst field is off in any role; infinite where nobody knows."""
-    spec, gaps = make_worlds(1, [0]).spec, dict[str, float]()
+    make_worlds, gaps = _maker(task), dict[str, float]()
+    spec = make_worlds(1, [0]).spec
     for role in spec.roles or (spec,):
         own = transforms if role.num_agents > 1 else without_agents(transforms)
         elements = admitted_elements(own, unrestricted(role)) if own else ()  # what is weighed need not be declared

@@ -22,14 +22,14 @@ from esp_cli.checking.comparison import (
     merged,
     state_by_state,
 )
-from esp_cli.checking.shifting import Shift
+from esp_cli.checking.shifting import Shift, Unmoved
 from esp_cli.checking.stepping import nudged, outcomes, seek_end, stretched, visit
 from esp_cli.checking.verdicts import ElementVerdict, FieldVerdict, Late, Watch, may_come, verdicts_of
 from esp_cli.symmetry import Element, Transform, build_transform
 from esp_envs.promises import MakeWorlds
 from esp_envs.spec import TaskSpec
 
-_MOST_WORLDS = 256
+_FEWEST_WORLDS, _MOST_WORLDS = 64, 256
 _NUMBERS = 1 << 18  # that all worlds together may show their agents at once; with pictures they are fewer
 _SOME = 8  # of more elements than these, each is first tried in one of so many states
 _FURTHER = "holds where play went, but further out {} would differ"
@@ -45,12 +45,12 @@ Visited = tuple[Tensor, Tensor]  # states [1, E, state width] and joint actions
 def check_paired(
     make: MakeWorlds,
     elements: Sequence[Element | Shift],
-    most: int | None = None,
+    slow: bool = False,
     watch: Watch = lambda *_: None,
     until: float = math.inf,
     spare: float = math.inf,
 ) -> list[ElementVerdict]:
-    """Judge elements on a task that can be set to a state, with outcomes of at most `most` worlds.
+    """Judge elements on a task that can be set to a state; of a `slow` simulator in fewer worlds and steps.
 
     Of many elements, each is first tried in an eighth of the states: what is broken there is broken. What holds in all
     states that were visited is tried further out, too, where random play does not go: an element that is broken there
@@ -58,9 +58,10 @@ def check_paired(
     `until` and `spare` as in `verdicts_of`.
     """
     shown = make(1, [0]).spec
-    worlds = max(64, min(most or _MOST_WORLDS, _NUMBERS // (shown.num_agents * shown.observation.width)))
-    visited = visit(make(worlds, [0]), watch, (until + time.monotonic()) / 2, early=most is not None)
-    judge = _Judge(make, shown, visited, most is not None, until, len(elements) > _SOME)
+    most = _FEWEST_WORLDS if slow else _MOST_WORLDS
+    worlds = max(_FEWEST_WORLDS, min(most, _NUMBERS // (shown.num_agents * shown.observation.width)))
+    visited = visit(make(worlds, [0]), watch, (until + time.monotonic()) / 2, early=slow)
+    judge = _Judge(make, shown, visited, slow, until, len(elements) > _SOME)
     return verdicts_of(elements, judge, lambda element: is_declared(element, shown), watch, until, spare)
 
 
@@ -74,7 +75,7 @@ class _Judge:
         self, make: MakeWorlds, spec: TaskSpec, moments: Sequence[Visited], slow: bool, until: float, quick: bool
     ) -> None:
         self._make, self._spec, self._moments, self._until, self._quick = make, spec, moments, until, quick
-        self._slow = slow
+        self._later = _LATER_OF_SLOW if slow else _LATER
         states, actions = (torch.cat(part, 1) for part in zip(*moments, strict=True))
         self._visited = moments if slow else [(states, actions)]
         self._some = [(state[:, ::_SOME], action[:, ::_SOME]) for state, action in self._visited]
@@ -99,20 +100,11 @@ class _Judge:
 
     @cached_property
     def _further(self) -> _Pairs | None:
-        further = [(stretched(state, self._spec.state), action) for state, action in self._some]
-        return self._tried(lambda: _Pairs(self._make, further, self._until))
+        return self._tried(lambda: [(stretched(state, self._spec.state), action) for state, action in self._some])
 
     @cached_property
     def _ending(self) -> _Pairs | None:
-        state = self._moments[0][0]
-
-        def sought() -> _Pairs | None:
-            env = self._make(state.shape[1], [0])
-            env.renews = False
-            found = seek_end(env, state, _LATER_OF_SLOW if self._slow else _LATER, self._until)
-            return None if found is None else _Pairs(self._make, [found], self._until)
-
-        return self._tried(sought)
+        return self._tried(lambda: [seek_end(self._make, self._moments[0][0], self._later, self._until)])
 
     @cached_property
     def _onwards(self) -> _Pairs | None:
@@ -120,19 +112,15 @@ class _Judge:
         if spec.terminates or spec.masks or spec.agents_end:  # nobody knows what may be done later, or for how long
             return None
         actions = [action[:, ::_SOME] for _, action in self._moments]
-        count = min(_LATER_OF_SLOW if self._slow else _LATER, spec.horizon)
         start = self._moments[0][0][:, ::_SOME]
-        episode = [(start, actions[k % len(actions)]) for k in range(count)]
-        return self._tried(lambda: _Pairs(self._make, episode, self._until, onwards=True))
+        episode = [(start, actions[k % len(actions)]) for k in range(min(self._later, spec.horizon))]
+        return self._tried(lambda: episode, onwards=True)
 
-    def _tried(self, pairs: Callable[[], _Pairs | None]) -> _Pairs | None:
+    def _tried(self, moments: Callable[[], Sequence[Visited]], onwards: bool = False) -> _Pairs | None:
         """Return pairs from states, or None where these, or what is done in them, are not for this task."""
-        try:
-            return pairs()
-        except Late:
-            raise
-        except (Exception, SystemExit):
-            return None
+        with suppress(Exception, SystemExit):
+            return _Pairs(self._make, moments(), self._until, onwards)
+        return None
 
     def _as_at_an_end(self, element: Element | Shift, found: ElementVerdict) -> ElementVerdict:
         """Judge ends that did not come in play where one was found."""
@@ -151,7 +139,7 @@ class _Judge:
 
     def _as_later(self, element: Element | Shift, found: ElementVerdict) -> ElementVerdict:
         broken = None
-        with suppress(Late):
+        with suppress(Late, Exception, SystemExit):  # the task may raise in those states
             broken = self._onwards.broken_later(element) if self._onwards is not None else None
         if broken is None and self._spec.hidden:
             return replace(found, fields=(), reason=_HIDDEN.format(" and ".join(self._spec.hidden)))
@@ -171,9 +159,9 @@ class _Pairs:
         for env in self._twins:
             env.renews = False
         self._spec = self._twins[0].spec
-        self._here = [self._play(env, visited, None, seed) for env, seed in zip(self._twins, _HERE, strict=True)]
+        self._here = [self._play(env, visited, Unmoved(), seed) for env, seed in zip(self._twins, _HERE, strict=True)]
         near = [(nudged(state), action) for state, action in visited]
-        self._here.append(self._play(self._twins[0], near, None, _HERE[0]))
+        self._here.append(self._play(self._twins[0], near, Unmoved(), _HERE[0]))
 
     def judge(self, element: Element | Shift) -> ElementVerdict:
         """Compare the steps from the images with the images of the steps."""
@@ -183,9 +171,8 @@ class _Pairs:
         def apart() -> list[Outcomes]:
             return [self._there(transform, twin, seed) for twin, seed in enumerate(_THERE)]
 
-        first, second, near = self._images(transform)
         try:
-            alike = self._there(transform, 0, _HERE[0])
+            first, second, alike, near = self._sides(transform)
             verdicts = [
                 self._unseen(name, first, alike)
                 or state_by_state(name, first, second, alike, near)
@@ -193,8 +180,6 @@ class _Pairs:
                 or by_distances(name, first[name], second[name], *(side[name] for side in apart()))
                 for name in first
             ]
-        except Late:
-            raise
         except (Exception, SystemExit) as error:
             reason = f"the task raises in the transformed states: {type(error).__name__}: {error}"
             return ElementVerdict(element.name, declared, (), reason)
@@ -203,18 +188,10 @@ class _Pairs:
     def broken_later(self, element: Element | Shift) -> tuple[FieldVerdict, ...] | None:
         """Return fields that are broken in so many states that rounding, which grows, is no reason.
 
-        None where chance or rounding decides some field, and none is broken, or the task raises.
+        None where chance or rounding decides some field, and none is broken.
         """
-        transform = self._transform(element)
-        first, second, near = self._images(transform)
-        try:
-            alike = self._there(transform, 0, _HERE[0])
-        except Late:
-            raise
-        except (Exception, SystemExit):
-            return None
-        sides = first, second, alike, near
-        rows = self._visited[0][0].shape[1] * _LATER_OF_SLOW
+        sides = self._sides(self._transform(element))
+        first, rows = sides[0], self._visited[0][0].shape[1] * _LATER_OF_SLOW
         # in either half of the worlds: an event that rounding tips in one of them is no breaking
         halves = [[{name: row[:rows][k::2] for name, row in side.items()} for side in sides] for k in (0, 1)]
         verdicts = {name: [state_by_state(name, *half) for half in halves] for name in first}
@@ -228,15 +205,17 @@ class _Pairs:
         holds = all(v and v.outcome == "holds" for name in first for v in verdicts[name])
         return tuple(merged([v for v in broken if v])) if broken or holds else None
 
-    def _transform(self, element: Element | Shift) -> Transform | Shift:
+    def _transform(self, element: Element | Shift) -> Transform | Unmoved:
         return element if isinstance(element, Shift) else build_transform([element], self._spec)
 
-    def _images(self, transform: Transform | Shift) -> list[Outcomes]:
-        return [by_field(steps, self._spec, transform) for steps in self._here]
+    def _sides(self, transform: Transform | Unmoved) -> tuple[Outcomes, Outcomes, Outcomes, Outcomes]:
+        """Return what `state_by_state` compares."""
+        first, second, near = (by_field(steps, self._spec, transform) for steps in self._here)
+        return first, second, self._there(transform, 0, _HERE[0]), near
 
-    def _there(self, transform: Transform | Shift, twin: int, seed: int) -> Outcomes:
+    def _there(self, transform: Transform | Unmoved, twin: int, seed: int) -> Outcomes:
         """Return outcomes of the images."""
-        return by_field(self._play(self._twins[twin], self._visited, transform, seed), self._spec, None)
+        return by_field(self._play(self._twins[twin], self._visited, transform, seed), self._spec, Unmoved())
 
     def _unseen(self, name: str, first: Outcomes, alike: Outcomes) -> FieldVerdict | None:
         """Say that ends, or rewards, which never came or never changed could not have shown a breaking."""

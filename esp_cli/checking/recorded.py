@@ -69,37 +69,38 @@ def collect(
     """
     worlds = env.num_envs * env.num_seeds
     rounds, count = -(-episodes // worlds), min(steps, env.spec.horizon)
-    found: list[list[tuple[Tensor, ...]]] = []
+    found: list[list[dict[str, Tensor]]] = []
     for k in range(rounds):
         observation = env.reset()
         over = torch.zeros(env.num_seeds, env.num_envs, dtype=torch.bool, device=env.device)
-        rows: list[tuple[Tensor, ...]] = []
+        rows: list[dict[str, Tensor]] = []
         for t in range(count):
             if (found or rows) and time.monotonic() > until:
                 break
             action = env.random_action()
             step = env.step(action)
-            row: tuple[Tensor, ...] = (observation.obs, action, step.reward, step.reached.obs)
-            row += () if observation.action_mask is None else (observation.action_mask,)
-            row += (step.terminated.unsqueeze(-1).expand_as(step.reward),) if env.spec.terminates else ()
-            if rows:
-                row = tuple(
-                    torch.where(over.view(*over.shape, *(1,) * (new.dim() - 2)), old, new)
-                    for old, new in zip(rows[-1], row, strict=True)
-                )
-            rows.append(row)
+            row = {"obs": observation.obs, "action": action, "reward": step.reward, "next_obs": step.reached.obs}
+            if observation.action_mask is not None:
+                row["action_mask"] = observation.action_mask
+            if env.spec.terminates:
+                row["terminated"] = step.terminated.unsqueeze(-1).expand_as(step.reward)
+            rows.append({name: picked(over, rows[-1][name], new) for name, new in row.items()} if rows else row)
             over = over | step.ended
             observation = step.next
             watch((k * count + t + 1) * worlds, rounds * count * worlds, "steps")
         if found and len(rows) < len(found[0]):
             break
         found.append(rows)
-    parts = [
-        torch.cat([torch.stack(column, 2).flatten(0, 1) for column in columns]).cpu()
-        for columns in zip(*(zip(*rows, strict=True) for rows in found), strict=True)
-    ]
-    optional = (("action_mask", env.spec.masks), ("terminated", env.spec.terminates))
-    return Transitions(**dict(zip((*_NEEDED, *(name for name, given in optional if given)), parts, strict=True)))
+    parts = {
+        name: torch.cat([torch.stack([row[name] for row in rows], 2).flatten(0, 1) for rows in found]).cpu()
+        for name in found[0][0]
+    }
+    return Transitions(**parts)
+
+
+def picked(flags: Tensor, there: Tensor, elsewhere: Tensor) -> Tensor:
+    """Return of two tensors [S, E, ...] the first in worlds whose flags [S, E] are on, the second elsewhere."""
+    return torch.where(flags.view(*flags.shape, *(1,) * (there.dim() - 2)), there, elsewhere)
 
 
 def outputs_of(data: Transitions) -> Tensor:
@@ -112,18 +113,10 @@ def outputs_of(data: Transitions) -> Tensor:
 
 def turned(data: Transitions, transform: Transform) -> Transitions:
     """Return transformed transitions."""
-
-    def one(part: Tensor) -> Tensor:
-        return part.unsqueeze(0)
-
-    return Transitions(
-        transform.obs(one(data.obs))[0],
-        transform.action(one(data.action))[0],
-        transform.per_agent(one(data.reward))[0],
-        transform.obs(one(data.next_obs))[0],
-        None if data.action_mask is None else transform.push_outputs(one(data.action_mask))[0],
-        None if data.terminated is None else transform.per_agent(one(data.terminated))[0],
-    )
+    moves = {"obs": transform.obs, "next_obs": transform.obs, "action": transform.action}
+    moves |= {"action_mask": transform.push_outputs}
+    parts = {name: part.unsqueeze(0) for name, part in vars(data).items() if part is not None}
+    return Transitions(**{name: moves.get(name, transform.per_agent)(part)[0] for name, part in parts.items()})
 
 
 def read_transitions(path: Path, spaces: Spaces) -> Transitions:

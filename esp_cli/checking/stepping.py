@@ -13,11 +13,13 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from esp_cli.checking.shifting import Shift
+from esp_cli.checking.recorded import picked
+from esp_cli.checking.shifting import Unmoved
 from esp_cli.checking.verdicts import Watch, stop_at
 from esp_cli.symmetry import Element, Transform, build_transform
 from esp_envs.base import Environment, Step, joined
 from esp_envs.errors import UserError
+from esp_envs.promises import MakeWorlds
 from esp_envs.spec import Continuous, Layout, TaskSpec
 from esp_envs.views import OthersAtRandom, RoleView
 
@@ -48,32 +50,24 @@ def visit(env: Environment, watch: Watch, until: float, early: bool = False) -> 
             steered[:, :half] = env.heuristic()[:, :half]
         step = env.step(steered)
         if env.spec.terminates and bool(step.terminated.any()):
-            before = (observation.state, steered)
-            ending = _where(step.terminated, before, ending or visited[0])
+            before, old = (observation.state, steered), ending or visited[0]
+            ending = (picked(step.terminated, before[0], old[0]), picked(step.terminated, before[1], old[1]))
         observation = step.next
         watch(t + 1, max(taken) + 1, "steps")
     return visited if ending is None else [*visited, ending]
 
 
-def _where(flags: Tensor, first: tuple[Tensor, Tensor], other: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """Return states and actions of the first pair where flags [1, E] are on, of the other elsewhere."""
-    state, action = (
-        torch.where(flags.view(1, -1, *(1,) * (a.dim() - 2)), a, b) for a, b in zip(first, other, strict=True)
-    )
-    return state, action
-
-
 def outcomes(
     env: Environment,
     visited: Sequence[tuple[Tensor, Tensor]],
-    turned: Transform | Shift | None,
+    turned: Transform | Unmoved,
     seed: int,
     until: float,
     onwards: bool = False,
 ) -> list[Step]:
     """Return the steps from each moment's states; the start's observation replaces `next` of the episode's end.
 
-    `turned` makes the images, None the states themselves. Agents of other roles act at random with the run's `seed`,
+    `turned` makes the images. Agents of other roles act at random with the run's `seed`,
     alike in each run, in images turned. With `onwards` episodes go on from the first moment's states, with the actions
     of all moments: clocks run, and what no state holds builds up.
     """
@@ -83,19 +77,19 @@ def outcomes(
         stop_at(until)
         if seen is None or not onwards:
             env.reset()
-            seen = env.set_state(state if turned is None else turned.state(state))
-        step = env.step(action if turned is None else turned.action(action))
+            seen = env.set_state(turned.state(state))
+        step = env.step(turned.action(action))
         steps.append(replace(step, next=seen, final=step.reached, metrics={}))
         seen = step.next
     return steps
 
 
-def _begin(env: Environment, steps: int, turned: Transform | Shift | None, seed: int) -> None:
+def _begin(env: Environment, steps: int, turned: Transform | Unmoved, seed: int) -> None:
     """Let all that chance decides follow from a seed, and agents of other roles act alike in each run, but turned."""
     worlds = env.inner if isinstance(env, RoleView) else env
     if isinstance(env, RoleView) and isinstance(env.turns, OthersAtRandom):
         _seed(worlds, 0)
-        image = _joint_image(worlds.spec, turned.elements[0].in_place if isinstance(turned, Transform) else Element())
+        image = _joint_image(worlds.spec, turned.elements[0].in_place)
         drawn = iter([] if worlds.spec.masks else [worlds.random_action() for _ in range(steps)])
         env.turns.image = lambda action: image(next(drawn, action))
     _seed(worlds, seed)
@@ -121,13 +115,14 @@ def _joint_image(spec: TaskSpec, scene: Element) -> Callable[[Tensor], Tensor]:
     return lambda action: joined([one.action(action[own]) for one, own in maps])
 
 
-def seek_end(env: Environment, state: Tensor, steps: int, until: float) -> tuple[Tensor, Tensor] | None:
-    """Return states [1, E, state width] and actions, some of which end an episode as play did not; None if not found.
+def seek_end(make: MakeWorlds, state: Tensor, steps: int, until: float) -> tuple[Tensor, Tensor]:
+    """Return states [1, E, state width] and actions, some of which end an episode as play did not, or a LookupError.
 
     In half of the worlds all things gather first, as at a goal. Worlds act at random, and go on from the quarter of
     them that was paid most so far.
     """
-    half = env.num_envs // 2
+    env = make(state.shape[1], [0])
+    env.renews, half = False, env.num_envs // 2
     state = torch.cat([stretched(state[:, :half], env.spec.state, decades=-3.0), state[:, half:]], 1)
     paid, count = torch.zeros(env.num_envs, device=state.device), max(1, env.num_envs // 4)
     for _ in range(steps):
@@ -141,7 +136,7 @@ def seek_end(env: Environment, state: Tensor, steps: int, until: float) -> tuple
         paid = paid + step.reward.flatten(0, 1).flatten(1).mean(-1).nan_to_num(-torch.inf)
         best = paid.topk(count).indices.repeat(-(-env.num_envs // count))[: env.num_envs]
         state, paid = step.reached.state[:, best], paid[best]
-    return None
+    raise LookupError
 
 
 def stretched(state: Tensor, layout: Layout, decades: float = 1.0) -> Tensor:

@@ -24,7 +24,7 @@ from esp_envs.views import RoleView
 PAIRED, TRANSITIONS = "paired states", "transitions"
 TOLERATED = {PAIRED: comparison.TOLERATED, TRANSITIONS: transitions.TOLERATED}
 """Standard deviations that a field may be off and yet hold, by method."""
-_COPIES, _FOREIGN = 256, 64  # most worlds of a task that takes no state, and of a simulator of others that does
+_COPIES = 256  # most worlds of a task that takes no state
 _EPISODES = 4096
 _UNTRIED = "shifts are tried where a task can be set to a state"
 _SEVERAL = "no state holds these items, and each agent's transitions do not show what others see beside them"
@@ -124,7 +124,7 @@ def judged(
         return env
 
     carried = [element for element in elements if _is_carried(element, probe.spec)]
-    by_pairs = paired.check_paired(settable, carried, None if native else _FOREIGN, watch, until, spare)
+    by_pairs = paired.check_paired(settable, carried, not native, watch, until, spare)
     verdicts = dict(zip(carried, by_pairs, strict=True))
     if rest := [element for element in elements if element not in verdicts]:  # items that the simulator does not name
         everybody = probe.inner.spec if isinstance(probe, RoleView) else probe.spec

@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from statistics import NormalDist
 from typing import Literal, TypeVar
 
 from esp_cli.checking.shifting import Shift
@@ -20,12 +19,10 @@ SIGNIFICANT = 6.0  # standard errors of a gap that is a breaking: of thousands o
 NEGLIGIBLE = 1e-3  # gap against the field's spread below which a difference is rounding
 LATE = "not tried, as the time was over"
 LEVEL = 0.05  # probability with which an element that is off by the tolerance may be said to hold, at most
-
-
 Named = TypeVar("Named", bound=Element | Shift)
 
 
-class Late(Exception):  # noqa: N818 - what is left is not covered, which is no error
+class Late(BaseException):  # what is left is not covered, which is no error of the task
     """The time for a check is over."""
 
 
@@ -85,11 +82,6 @@ def concluded(
 def may_come(field: str, ends: bool, pays: bool) -> bool:
     """Return whether a field that never changed may do so elsewhere: an end; a reward, unless it pays and play ends."""
     return field == "end" or (field == "reward" and not (ends and pays))
-
-
-def chance(gap: float, tolerance: float, error: float) -> float:
-    """Return how likely a normal gap is to be this small, if its expectation is the tolerance."""
-    return NormalDist().cdf((gap - tolerance) / max(error, 1e-12))
 
 
 def verdicts_of(

@@ -40,7 +40,7 @@ def settings(
 
 
 def _sections(of: str | None) -> Sequence[Section]:
-    from esp_cli.training.settings import own_section, sections, task_section
+    from esp_cli.training.settings import own_section, section_of, sections
 
     if of is not None and ":" in of:
         return [own_section(of)]
@@ -49,7 +49,7 @@ def _sections(of: str | None) -> Sequence[Section]:
     if found or of is None:
         return found
     if of in installed_tasks():
-        return [task_section(of)]
+        return [section_of("task", of)]
     names = [section.name for section in built_in]
     hint = did_you_mean(of, names) or f"; there is {', '.join(names)}"
     raise UserError(f"nothing with settings is called '{of}'{hint}")

@@ -25,7 +25,7 @@ from esp_cli.networks.policy import Policy
 from esp_cli.networks.roles import RolesPolicy
 from esp_cli.policies import bundled
 from esp_cli.training.build import build_environment, generators, spec_of
-from esp_cli.training.checkpoint import digest, read_policy
+from esp_cli.training.checkpoint import POLICY_FORMAT, digest, load_checkpoint
 from esp_cli.training.config import InitialPolicy, RunConfig, resolve_task_settings
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.settings import parse_config
@@ -57,7 +57,7 @@ class TrainedPolicy:
     def read(cls, path: Path, sha256: str | None = None) -> TrainedPolicy:
         """Read a run folder (its newest checkpoint, else its policy file), or a file, whose SHA-256 may be stated."""
         if sha256 is not None or path.is_file():
-            tensors, meta = read_policy(path, sha256)
+            tensors, meta = load_checkpoint(path, POLICY_FORMAT, sha256)
             writer = meta.get("esp_version", __version__)
             return _build(path, parse_config(meta.get("config"), path, writer), tensors, meta)
         folder, notes = RunFolder.open(path), list[str]()
@@ -68,7 +68,7 @@ class TrainedPolicy:
             further = _FURTHER if config.network.free_of_counts else ()
             return replace(found, further={name: t for name, t in tensors.items() if name.startswith(further)})
         if folder.policy_path.is_file():  # an ended trial of a tuning keeps no checkpoints
-            return _build(path, config, *read_policy(folder.policy_path))
+            return _build(path, config, *load_checkpoint(folder.policy_path, POLICY_FORMAT))
         raise UserError(f"{path} holds no checkpoint yet; train on with esp train --resume {quote(str(path))}")
 
     def transfer(self, settings: Mapping[str, object]) -> TrainedPolicy:

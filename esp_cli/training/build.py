@@ -27,15 +27,10 @@ from esp_envs.spec import TaskSpec
 from esp_envs.views import Compass
 
 
-def stream_seed(seed: int, *names: object) -> int:
-    """Return a 63-bit seed that depends on the run seed and the stream's names alone."""
-    text = "/".join(str(part) for part in (seed, *names))
-    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "little") >> 1
-
-
 def stream_seeds(seeds: Sequence[int], *names: object) -> list[int]:
-    """Return the stream's seed for each run seed."""
-    return [stream_seed(seed, *names) for seed in seeds]
+    """Return for each run seed one of 63 bits that depends on it and on the stream's names alone."""
+    digests = (hashlib.sha256("/".join(map(str, (seed, *names))).encode()).digest() for seed in seeds)
+    return [int.from_bytes(digest[:8], "little") >> 1 for digest in digests]
 
 
 def generators(seeds: Sequence[int], *names: object) -> list[torch.Generator]:
@@ -92,16 +87,11 @@ def build_learner(config: RunConfig) -> Learner:
     settings = cls.config_class(**config.algorithm_settings)
     refuse_what_does_not_fit(config, settings, spec_of(config))
     env = build_environment(config, settings.num_envs, "training worlds", measures=False)
-    if env.spec.roles:
-        return _learner_of_roles(cls, env, settings, config)
-    own, of_prior = generators(config.seeds, "learner"), generators(config.seeds, "prior")
-    return cls(env, settings, config.network, config.prior, own, of_prior)
-
-
-def _learner_of_roles(cls: type[Learner], env: Environment, settings: LearnerConfig, config: RunConfig) -> RolesLearner:
-    names = [role.name for role in env.spec.roles]
-    own, of_prior = ({name: generators(config.seeds, what, name) for name in names} for what in ("learner", "prior"))
-    return RolesLearner(cls, env, settings, config.network, config.prior, own, of_prior)
+    streams = ("learner", "prior")
+    if not env.spec.roles:
+        return cls(env, settings, config.network, config.prior, *(generators(config.seeds, name) for name in streams))
+    of_roles = [{role.name: generators(config.seeds, name, role.name) for role in env.spec.roles} for name in streams]
+    return RolesLearner(cls, env, settings, config.network, config.prior, *of_roles)
 
 
 def refuse_what_does_not_fit(config: RunConfig, settings: LearnerConfig, spec: TaskSpec) -> None:

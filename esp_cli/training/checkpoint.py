@@ -59,14 +59,9 @@ def save_checkpoint(
     format_name: str = CHECKPOINT_FORMAT,
 ) -> None:
     """Write dense tensors by name, on any device, and a JSON-able description atomically, into a folder that exists."""
-    if taken := sorted(_RESERVED & meta.keys()):
-        raise CheckpointError(f"cannot write {path}: the description may not use the reserved key '{taken[0]}'")
-    try:
-        # through JSON and back, so that the digest is of what a reader will see (lists for tuples, text keys)
-        described = json.loads(json.dumps(dict(meta), allow_nan=False))
-    except (TypeError, ValueError, RecursionError) as error:
-        raise CheckpointError(f"cannot write {path}: its description is not JSON ({error})") from None
-    stored, described = _storable(path, tensors), {"format": format_name, "version": _VERSION, **described}
+    stored = _storable(path, tensors)
+    # through JSON and back, so that the digest is of what a reader will see (lists for tuples, text keys)
+    described = json.loads(json.dumps({"format": format_name, "version": _VERSION, **meta}, allow_nan=False))
     described["sha256"] = digest(stored, described)
     content = safetensors_torch.save(stored, metadata={METADATA_KEY: json.dumps(described, allow_nan=False)})
     if struct.unpack_from("<Q", content)[0] > _MAX_HEADER_BYTES or len(content) > _MAX_FILE_BYTES:
@@ -117,19 +112,21 @@ def _storable(path: str | os.PathLike[str], tensors: Mapping[str, Tensor]) -> di
     stored: dict[str, Tensor] = {}
     storages: set[int] = set()
     for name, tensor in tensors.items():
-        if not isinstance(name, str) or name == "__metadata__":
-            raise CheckpointError(f"cannot write {path}: {name!r} cannot be the name of a tensor")
-        if not isinstance(tensor, Tensor) or tensor.layout != torch.strided or tensor.dtype not in _DTYPES:
-            found = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
-            raise CheckpointError(f"cannot write {path}: '{name}' is no dense tensor of a storable dtype ({found})")
-        if tensor.dim() > _MAX_DIMENSIONS:
-            raise CheckpointError(f"cannot write {path}: '{name}' has more than {_MAX_DIMENSIONS} dimensions")
+        if tensor.layout != torch.strided or not _is_readable(tensor):
+            raise CheckpointError(
+                f"cannot write {path}: '{name}' is no dense tensor of a storable dtype and at most {_MAX_DIMENSIONS} "
+                f"dimensions ({tensor.dtype})"
+            )
         dense = tensor.detach().cpu().contiguous()
         if dense.untyped_storage().data_ptr() in storages:
             dense = dense.clone()
         storages.add(dense.untyped_storage().data_ptr())
         stored[name] = dense
     return stored
+
+
+def _is_readable(tensor: Tensor) -> bool:
+    return tensor.dtype in _DTYPES and tensor.dim() <= _MAX_DIMENSIONS
 
 
 def _read(path: Path, whole: bool = True) -> tuple[dict[str, Any], bytes]:
@@ -170,9 +167,7 @@ def _declared_bytes(header: Mapping[str, Any]) -> int:
 def _description(header: Mapping[str, Any], format_name: str) -> dict[str, Any]:
     """Return the JSON object under the key ``esp`` of a file of the wanted format."""
     metadata = header.get("__metadata__")
-    if not isinstance(metadata, dict) or any(not isinstance(value, str) for value in metadata.values()):
-        raise CheckpointError("was not written by esp: it has no metadata")
-    if METADATA_KEY not in metadata:
+    if not isinstance(metadata, dict) or not isinstance(metadata.get(METADATA_KEY), str):
         raise CheckpointError(f"was not written by esp: its metadata has no '{METADATA_KEY}'")
     description = parse_object(metadata[METADATA_KEY], "description")
     if description.get("format") != format_name:
@@ -189,7 +184,7 @@ def _description(header: Mapping[str, Any], format_name: str) -> dict[str, Any]:
 
 def _check_tensors(tensors: Mapping[str, Tensor]) -> None:
     for name, tensor in tensors.items():
-        if tensor.dtype not in _DTYPES or tensor.dim() > _MAX_DIMENSIONS:
+        if not _is_readable(tensor):
             raise CheckpointError(f"is damaged: its tensor {shortened(repr(name))} has another dtype or rank than any")
         # a bool that is neither 0 nor 1 is undefined behaviour in the code that reads it
         if tensor.dtype == torch.bool and tensor.numel() and int(tensor.view(torch.uint8).max()) > 1:
@@ -211,23 +206,6 @@ def _canonical(value: Any) -> bytes:
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode("ascii")
 
 
-def same(a: Tensor, b: Tensor) -> bool:
-    """Return whether two tensors are equal bit for bit, NaN included."""
-    # cloned, since a part of a longer buffer has strides that no view as bytes can have
-    x, y = (t.cpu().flatten().clone(memory_format=torch.contiguous_format).view(torch.uint8) for t in (a, b))
-    return a.dtype == b.dtype and a.shape == b.shape and torch.equal(x, y)
-
-
-def write_policy(path: str | os.PathLike[str], tensors: Mapping[str, Tensor], meta: Mapping[str, Any]) -> None:
-    """Write a policy file; see `save_checkpoint`."""
-    save_checkpoint(path, tensors, meta, POLICY_FORMAT)
-
-
-def read_policy(path: str | os.PathLike[str], sha256: str | None = None) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read a policy file; see `load_checkpoint`."""
-    return load_checkpoint(path, POLICY_FORMAT, sha256)
-
-
 def describe_policy(config: RunConfig, spec: TaskSpec, step: int, returns: Sequence[float]) -> dict[str, Any]:
     """Return the description by which a policy file is used without its run folder."""
     return {
@@ -244,7 +222,7 @@ def describe_policy(config: RunConfig, spec: TaskSpec, step: int, returns: Seque
 
 def read_initial(path: Path, recorded: InitialPolicy) -> dict[str, Tensor]:
     """Read the weights that a run starts from, and check that they are those which its configuration records."""
-    tensors, _ = read_policy(path)
+    tensors, _ = load_checkpoint(path, POLICY_FORMAT)
     if digest(tensors, {}) != recorded.sha256:
         raise CheckpointError(f"{path} does not hold the policy that the run started from; train anew")
     return tensors

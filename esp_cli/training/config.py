@@ -8,12 +8,11 @@ import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, Field, ValidationInfo, field_validator
-from pydantic_core import to_jsonable_python
+from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator
 
 from esp_cli.algorithms.presets import ALGORITHMS, preset_layers
 from esp_cli.defaults import MAX_SEEDS, MAX_STEPS, STEPS
-from esp_cli.files.documents import Strict, parse_value, validated, without_gone
+from esp_cli.files.documents import Strict, one_sentence, parse_value, validate, validated, without_gone
 from esp_cli.files.formatting import nearest, shortened
 from esp_cli.networks.build import AnyNetworkConfig, network_class
 from esp_cli.networks.plain import MlpConfig
@@ -22,7 +21,6 @@ from esp_cli.symmetry import default_transforms
 from esp_cli.symmetry.admission import carries
 from esp_envs.errors import UserError
 from esp_envs.registry import TASKS, make, task_class
-from esp_envs.spec import TaskSpec
 
 SECTIONS = {"task": "task_settings", "network": "network", "prior": "prior", "evaluation": "evaluation"}
 """The sections that settings of every run have, and where its configuration holds them."""
@@ -87,12 +85,11 @@ class RunConfig(Strict):
             "task": task.without_effect(),
             "prior": self.prior.without_effect() | of_others,
             "network": self.network.without_effect() | ({"compiled"} if self.device == "cuda" else set()),
-            self.algorithm: settings.without_effect(self.network, self._spec),
+            self.algorithm: settings.without_effect(
+                self.network, lambda: make(self.task, 1, (0,), self.task_settings).spec
+            ),
         }
         return frozenset(f"{section}.{name}" for section, names in idle.items() for name in names)
-
-    def _spec(self) -> TaskSpec:
-        return make(self.task, 1, (0,), self.task_settings).spec
 
     def own_words(self, *others: RunConfig) -> list[str]:
         """Return the options that name code of the user in a command about runs, each once: ["--task", "mine:Task"]."""
@@ -243,16 +240,19 @@ def resolve_task_settings(task: str, settings: Mapping[str, object]) -> dict[str
 
 
 def completed(config: RunConfig) -> RunConfig:
-    """Return a stored configuration with the defaults of the settings that its task and learner gained since."""
-    models: dict[str, type[BaseModel]] = {
-        "task_settings": task_class(config.task).Settings,
-        "algorithm_settings": ALGORITHMS[config.algorithm].config_class,
-    }
+    """Return a stored configuration with the defaults of the settings that its task and learner gained since.
+
+    Settings that these do not have, or whose values they do not take, are a UserError.
+    """
     changes = {}
-    for part, model in models.items():
-        fields = {name: field for name, field in model.model_fields.items() if not field.is_required()}
-        defaults = {name: f.get_default(call_default_factory=True) for name, f in fields.items()}
-        changes[part] = to_jsonable_python(defaults) | getattr(config, part)
+    for part, section, model in (
+        ("task_settings", "task", task_class(config.task).Settings),
+        ("algorithm_settings", config.algorithm, ALGORITHMS[config.algorithm].config_class),
+    ):
+        try:
+            changes[part] = validate(model, getattr(config, part)).model_dump(mode="json")
+        except ValidationError as error:
+            raise UserError(one_sentence(error, model, section)) from None
     return config.model_copy(update=changes)
 
 

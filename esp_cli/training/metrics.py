@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     import pandas
 
 Floats = NDArray[np.float64]
-Value = float | int | None | Sequence[float | None] | NDArray[Any] | Tensor
+Value = float | None | list[float | None] | Tensor
 """What a row may hold under a name: a number, or one per seed; None where there is none, as for a stopped seed."""
 
 
@@ -129,7 +129,7 @@ def column(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[NDArray[np.int
     return np.array([step for step, _ in found], dtype=np.int64), values
 
 
-class Metrics(Shown, Mapping[str, Floats]):
+class Metrics(Shown, dict[str, Floats]):
     """Metrics by name: one row per update, one column per seed, [U, S]; [U, 1] of what the run has as a whole.
 
     Example:
@@ -149,35 +149,24 @@ class Metrics(Shown, Mapping[str, Floats]):
     def __init__(self, rows: Sequence[Mapping[str, Any]], seeds: Sequence[int]) -> None:
         self.seeds = tuple(seeds)
         self.steps: NDArray[np.int64] = np.array([row["step"] for row in rows], dtype=np.int64)
-        self._arrays: dict[str, Floats] = {}
         self._whole: set[str] = set()
         for index, row in enumerate(rows):
             for name, value in row.items():
                 if name == "step":
                     continue
-                if name not in self._arrays:
-                    columns = len(self.seeds) if isinstance(value, list) else 1
-                    self._arrays[name] = np.full((len(rows), columns), math.nan)
-                    self._whole |= set() if isinstance(value, list) else {name}
-                self._arrays[name][index] = np.array(value, dtype=np.float64)
+                columns = len(self.seeds) if isinstance(value, list) else 1
+                self._whole |= set() if isinstance(value, list) else {name}
+                array = self.setdefault(name, np.full((len(rows), columns), math.nan))
+                array[index] = np.array(value, dtype=np.float64)
 
     def _facts(self) -> Mapping[str, object]:
         """Return what there is, and the newest mean over seeds of what was evaluated."""
-        last = {name: array[np.isfinite(array).all(1)][-1:] for name, array in self._arrays.items() if "eval/" in name}
+        last = {name: array[np.isfinite(array).all(1)][-1:] for name, array in self.items() if "eval/" in name}
         newest = {name: f"{rows.mean():.4g}" for name, rows in last.items() if rows.size}
         what = (
             f"{len(self.steps)} of {len(self)} names, steps {self.steps.min(initial=0)} to {self.steps.max(initial=0)}"
         )
         return {"rows": what, "seeds": ", ".join(map(str, self.seeds)), **newest}
-
-    def __getitem__(self, name: str) -> Floats:
-        return self._arrays[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._arrays)
-
-    def __len__(self) -> int:
-        return len(self._arrays)
 
     def to_pandas(self) -> pandas.DataFrame:
         """Return a table indexed by steps, with columns (metric, seed); "run" stands for what the run has as a whole.
@@ -191,7 +180,7 @@ class Metrics(Shown, Mapping[str, Floats]):
             raise UserError("to_pandas needs pandas, which is not installed: pip install pandas") from None
         columns = {
             (name, seed): array[:, column]
-            for name, array in self._arrays.items()
+            for name, array in self.items()
             for column, seed in enumerate(("run",) if name in self._whole else self.seeds)
         }
         table = pd.DataFrame(columns, index=pd.Index(self.steps, name="step"))
@@ -205,19 +194,14 @@ def elapsed_s(row: Mapping[str, Any]) -> float:
     return float(seconds) if isinstance(seconds, int | float) else 0.0
 
 
-def _plain(name: str, value: Value) -> float | int | list[float | int | None] | None:
+def _plain(name: str, value: Value) -> float | list[float | None] | None:
     """Return a number, or a list of numbers, with None where it is not finite."""
-    plain = value.tolist() if isinstance(value, Tensor | np.ndarray | np.generic) else value
-    return [_number(name, item) for item in plain] if isinstance(plain, list | tuple) else _number(name, plain)
-
-
-def _number(name: str, value: Any) -> float | int | None:
-    number = value.item() if isinstance(value, np.generic) else value
-    if number is None:
-        return None
-    if not isinstance(number, bool | int | float):
+    plain = value.tolist() if isinstance(value, Tensor) else value
+    numbers = plain if isinstance(plain, list) else [plain]
+    if not all(number is None or isinstance(number, int | float) for number in numbers):
         raise MetricsError(f"the metric '{name}' is neither a number nor a list of one number per seed")
-    return number if math.isfinite(number) else None
+    finite = [None if number is None or not math.isfinite(number) else number for number in numbers]
+    return finite if isinstance(plain, list) else finite[0]
 
 
 def _rows(path: Path) -> Iterator[tuple[bytes, dict[str, Any]]]:

@@ -39,7 +39,6 @@ from esp_cli.training.checkpoint import (
     load_checkpoint,
     read_description,
     save_checkpoint,
-    write_policy,
 )
 from esp_cli.training.folder_names import CHECKPOINTS, CONFIG, INITIAL, LOCK, METRICS, POLICY
 from esp_envs.errors import UserError
@@ -98,7 +97,7 @@ class RunFolder:
                 (path / CHECKPOINTS).mkdir(exist_ok=True)
                 os.close(open_own(folder.metrics_path, os.O_WRONLY))
                 if initial is not None:
-                    write_policy(folder.initial_path, initial, {})
+                    save_checkpoint(folder.initial_path, initial, {}, POLICY_FORMAT)
                 RUN_FORMAT.write(path / CONFIG, {RUN_ID: folder.identity, **config})
         return folder
 
@@ -154,7 +153,7 @@ class RunFolder:
 
     def write_policy(self, tensors: Mapping[str, Tensor], meta: Mapping[str, Any]) -> None:
         """Write the trained policy as a file of its own that needs no run folder; training is done with that."""
-        write_policy(self.policy_path, tensors, meta)
+        save_checkpoint(self.policy_path, tensors, meta, POLICY_FORMAT)
         self._remove_superseded()
 
     def latest_checkpoint(self, note: Callable[[str], object]) -> tuple[dict[str, Tensor], dict[str, Any]] | None:

@@ -37,7 +37,6 @@ _UNITS = {
 }
 """Units by the ending of a setting's name; a field may name another one as `json_schema_extra={"unit": ...}`."""
 
-
 Kind = Literal["algorithm", "task", "network", "prior", "evaluation"]
 
 
@@ -67,14 +66,9 @@ class Section:
 def sections() -> Iterator[Section]:
     """Yield the sections of everything that is built in: learners, tasks, networks, prior, evaluation."""
     for kind, (registry, _) in _KINDS.items():
-        yield from (_section(kind, name) for name in filter(registry.ships, registry))
+        yield from (section_of(kind, name) for name in filter(registry.ships, registry))
     yield Section("prior", "prior", _settings("prior", PriorConfig))
     yield Section("evaluation", "evaluation", _settings("evaluation", EvaluationConfig))
-
-
-def task_section(name: str) -> Section:
-    """Return the settings of one task, which may be of the caller; raises a UserError where there is no such task."""
-    return _section("task", name)
 
 
 def own_section(name: str) -> Section:
@@ -86,7 +80,7 @@ def own_section(name: str) -> Section:
         except UserError as refusal:
             refusals.append(str(refusal))
             continue
-        return _section(kind, name)
+        return section_of(kind, name)
     strange = f"'{name}' is no task, algorithm or network; check its base class"
     raise UserError(next((said for said in refusals if not said.startswith(f"'{name}' is not a")), strange))
 
@@ -98,7 +92,8 @@ _KINDS: dict[Kind, tuple[Registry[Any], Callable[[str], type[BaseModel]]]] = {
 }
 
 
-def _section(kind: Kind, name: str) -> Section:
+def section_of(kind: Kind, name: str) -> Section:
+    """Return the settings of one algorithm, task or network, which may be of the caller; a UserError if it is none."""
     return Section(name, kind, _settings(name if kind == "algorithm" else kind, _KINDS[kind][1](name)))
 
 
@@ -217,16 +212,6 @@ def parse_config(data: object, source: Path, writer: object = __version__) -> Ru
         other = "" if writer == __version__ else f" (written by esp {str(writer)[:20]}, this is {__version__})"
         raise UserError(f"{source}: {one_sentence(error, RunConfig, 'config')}{other}") from None
     try:
-        learner = ALGORITHMS[config.algorithm]
+        return completed(config)
     except UserError as error:
         raise UserError(f"{source}: {error}") from None
-    _check_settings(task_class(config.task).Settings, config.task_settings, "task", source)
-    _check_settings(learner.config_class, config.algorithm_settings, config.algorithm, source)
-    return completed(config)
-
-
-def _check_settings(model: type[BaseModel], settings: object, section: str, source: Path) -> None:
-    try:
-        validate(model, settings)
-    except ValidationError as error:
-        raise UserError(f"{source}: {one_sentence(error, model, section)}") from None

@@ -78,13 +78,14 @@ class WeightsAndBiases:
         self._seeds = run.seeds
         folder = run.folder.absolute()
         store = own_folder(folder / "wandb")
-        places = {f"WANDB_{place}_DIR": str(store / place.lower()) for place in ("CACHE", "CONFIG", "DATA", "ARTIFACT")}
-        self._set = [name for name in places if name not in os.environ]  # until the run closes: the next has its own
-        os.environ.update({name: places[name] for name in self._set})
         os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
         mode: Any = os.environ.get("WANDB_MODE", "offline")
         off = ("disable_git", "disable_code", "disable_job_creation", "x_disable_stats", "x_disable_meta")
-        try:
+        with contextlib.ExitStack() as places:  # until the run closes: the next has its own
+            for place in ("CACHE", "CONFIG", "DATA", "ARTIFACT"):
+                if (name := f"WANDB_{place}_DIR") not in os.environ:
+                    os.environ[name] = str(store / place.lower())
+                    places.callback(os.environ.pop, name, None)
             self._run = wandb.init(
                 project=os.environ.get("WANDB_PROJECT", "esp"),
                 name=folder.name,
@@ -95,9 +96,7 @@ class WeightsAndBiases:
                 config=dict(run.config),
                 settings=wandb.Settings(console="off", silent=True, **dict.fromkeys(off, True)),
             )
-        except BaseException:
-            self._forget_places()
-            raise
+            self._places = places.pop_all()
         # not wandb's own step, which may not go back as that of a resumed run does
         self._run.define_metric("*", step_metric="step")
 
@@ -105,14 +104,8 @@ class WeightsAndBiases:
         self._run.log({"step": step, **named(values, self._seeds)})
 
     def close(self) -> None:
-        try:
+        with self._places:
             self._run.finish()
-        finally:
-            self._forget_places()
-
-    def _forget_places(self) -> None:
-        for name in self._set:
-            os.environ.pop(name, None)
 
 
 class MlFlow:

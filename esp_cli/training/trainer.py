@@ -25,12 +25,13 @@ from esp_cli.training.build import (
     play,
     stream_seeds,
 )
-from esp_cli.training.checkpoint import describe_policy, read_initial, same
+from esp_cli.training.checkpoint import describe_policy, read_initial
 from esp_cli.training.config import RunConfig
 from esp_cli.training.metrics import MetricsWriter, column, read_metrics, truncate_metrics
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.trackers import TrackedRun, open_trackers, require
 from esp_envs.errors import UserError
+from esp_envs.promises import equal
 
 
 def checkpoint_seconds() -> float:
@@ -248,10 +249,9 @@ class Trainer:
         if not self.learner.collector.env.has("state_dict"):  # worlds that begin anew, whatever was saved of them
             names = {name for name in names if not name.startswith("collector.")}
         for name in sorted(names):
-            fits = name in now and name in tensors and same(now[name], tensors[name])
-            if fits and name in before:
-                a, b = before[name], now[name]
-                # a replay has grown, and checks its shapes itself
+            a, b, stored = before.get(name), now.get(name), tensors.get(name)
+            fits = b is not None and stored is not None and b.dtype == stored.dtype and equal(b.cpu(), stored)
+            if fits and a is not None and b is not None:  # a replay has grown, and checks its shapes itself
                 fits = a.dtype == b.dtype and (a.shape == b.shape or name.startswith("replay."))
             if not fits:
                 raise UserError(f"the checkpoint in {self.folder.path} does not fit this configuration ({name})")

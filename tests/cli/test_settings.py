@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from esp_cli.training.config import resolve_config
-from esp_cli.training.settings import Section, sections, task_section
+from esp_cli.training.settings import Section, section_of, sections
 from tests.cli.running import esp, refused
 
 SECTIONS = tuple(sections())
@@ -72,7 +72,7 @@ def test_a_task_of_ones_own_has_settings_too(tmp_path: Path, monkeypatch: pytest
     (section,) = json.loads(esp("settings", "wide:Wide", "--json", "-").stdout)
     (slope,) = [one for one in section["settings"] if one["name"] == "task.slope_rad"]
     assert (slope["default"], slope["unit"], slope["bounds"]) == (0.5, "rad", "from 0")
-    assert task_section("wide:Wide").kind == "task"
+    assert section_of("task", "wide:Wide").kind == "task"
 
 
 def test_a_name_without_settings_is_one_sentence() -> None:

@@ -15,7 +15,7 @@ from esp_cli.prior import PriorConfig, SymmetryPrior
 from esp_cli.run import Run
 from esp_cli.symmetry import build_transform, mirror, parse_elements, rotation, transform_set
 from esp_cli.training.build import build_environment
-from esp_cli.training.checkpoint import read_policy
+from esp_cli.training.checkpoint import POLICY_FORMAT, load_checkpoint
 from esp_cli.training.config import RunConfig, resolve_config
 from esp_cli.training.run_folder import RunFolder
 from esp_envs import make
@@ -182,7 +182,7 @@ def test_a_prior_that_never_fades_trains_as_ever_and_one_that_does_trains_otherw
 
 def train_small(folder: Path, algorithm: str, *more: str) -> str:
     esp("train", "--task", "navigation", *SMALL[algorithm].split(), "--seeds", "2", "--out", folder, *more)
-    return digest(read_policy(folder / "policy.safetensors")[0])
+    return digest(load_checkpoint(folder / "policy.safetensors", POLICY_FORMAT)[0])
 
 
 def worlds(num_envs: int = 16, **settings: object) -> Compass:

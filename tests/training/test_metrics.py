@@ -24,16 +24,16 @@ def path(tmp_path):
     return path
 
 
-def test_rows_take_tensors_arrays_and_numbers(tmp_path):
+def test_rows_take_tensors_lists_and_numbers(tmp_path):
     path = tmp_path / "m.jsonl"
     with MetricsWriter(path) as writer:
         writer.write(
             100,
             {
                 "train/loss": torch.tensor([0.5, float("nan")]),
-                "train/kl": np.array([1.0, -math.inf]),
+                "train/kl": [1.0, -math.inf],
                 "train/count": torch.tensor(3),
-                "train/list": [1, np.float32(0.25), None],
+                "train/list": [1, 0.25, None],
                 "time/seconds": 0.1,
             },
         )
