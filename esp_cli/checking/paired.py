@@ -139,7 +139,7 @@ class _Judge:
 
     def _as_later(self, element: Element | Shift, found: ElementVerdict) -> ElementVerdict:
         broken = None
-        with suppress(Late, Exception, SystemExit):  # the task may raise in those states
+        with suppress(Late):
             broken = self._onwards.broken_later(element) if self._onwards is not None else None
         if broken is None and self._spec.hidden:
             return replace(found, fields=(), reason=_HIDDEN.format(" and ".join(self._spec.hidden)))
@@ -188,9 +188,12 @@ class _Pairs:
     def broken_later(self, element: Element | Shift) -> tuple[FieldVerdict, ...] | None:
         """Return fields that are broken in so many states that rounding, which grows, is no reason.
 
-        None where chance or rounding decides some field, and none is broken.
+        None where chance or rounding decides some field, and none is broken, or the task raises.
         """
-        sides = self._sides(self._transform(element))
+        try:
+            sides = self._sides(self._transform(element))
+        except (Exception, SystemExit):
+            return None
         first, rows = sides[0], self._visited[0][0].shape[1] * _LATER_OF_SLOW
         # in either half of the worlds: an event that rounding tips in one of them is no breaking
         halves = [[{name: row[:rows][k::2] for name, row in side.items()} for side in sides] for k in (0, 1)]
