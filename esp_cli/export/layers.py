@@ -5,18 +5,15 @@ A kind is a function here, an entry of `LAYERS` in `numpy_policy.py` and a funct
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional as F
-
-from esp_envs.spec import others_of
 
 Floats = NDArray[np.float32]
 
@@ -27,9 +24,8 @@ NORM_EPSILON = 1e-5  # layer normalisation adds this to the variance, as torch d
 class Layer:
     """One step of a program: rows x to rows y.
 
-    In C (in the macros of `templates/policy.c.jinja`) w0, w1, ... stand for the arrays. `torch` makes y [rows, width]
-    of x, the arrays, and the observations [rows, D]; the kind `gru` takes the hidden state [rows, H] instead of the
-    latter, `sets` the tables.
+    In C (in the names of `templates/policy.c.jinja`) w0, w1, ... stand for the arrays. `torch` makes y [rows, width]
+    of x, the arrays, and what the kind asks for: `gru` for the hidden state [rows, H], `sets` for the tables.
     """
 
     kind: str  # its name in JSON
@@ -49,7 +45,7 @@ def affine(weight: Floats, bias: Floats) -> Layer:
     inputs, outputs = weight.shape
     return Layer(
         "affine",
-        c=f"EACH affine(w0, w1, {inputs}, {outputs}, X, Y);\nSWAP;",
+        c=f"affine(w0, w1, {inputs}, {outputs}, x, y);\nSWAP;",
         torch=lambda x, w, _: torch.addmm(w[1], x, w[0]),
         arrays=(weight, bias),
         width=max(inputs, outputs),
@@ -60,17 +56,17 @@ def norm(weight: Floats, bias: Floats) -> Layer:
     """Return (x - mean) / sqrt(variance + 1e-5) * weight + bias over a row."""
     return Layer(
         "norm",
-        c=f"EACH normalise(w0, w1, {weight.size}, X);",
+        c=f"normalise(w0, w1, {weight.size}, x);",
         torch=lambda x, w, _: F.layer_norm(x, x.shape[-1:], w[0], w[1], NORM_EPSILON),
         arrays=(weight, bias),
     )
 
 
-def activation(kind: Literal["relu", "tanh"], width: int) -> Layer:
+def activation(kind: str, width: int) -> Layer:
     """Return relu or tanh of every number of a row."""
     return Layer(
         kind,
-        c=f"EACH apply_{kind}(X, {width});",
+        c=f"apply_{kind}(x, {width});",
         torch=lambda x, *_: torch.relu(x) if kind == "relu" else torch.tanh(x),
         numbers=(("width", width),),
     )
@@ -92,81 +88,10 @@ def gru(weight: Floats, bias: Floats, hidden_weight: Floats, hidden_bias: Floats
 
     return Layer(
         "gru",
-        c=f"""
-            affine(w0, w1, {len(weight)}, 3 * {size}, x, into);
-            affine(w2, w3, {size}, 3 * {size}, memory, back);
-            recur({size}, into, back, memory);
-            memcpy(x, memory, sizeof(float) * {size});""",
+        c=f"affine(w0, w1, {len(weight)}, 3 * {size}, x, into);\n"
+        f"affine(w2, w3, {size}, 3 * {size}, memory, back);\n"
+        f"recur({size}, into, back, memory);\n"
+        f"memcpy(x, memory, sizeof(float) * {size});",
         torch=advance,
         arrays=(weight, bias, hidden_weight, hidden_bias),
     )
-
-
-def cut(begin: int, end: int) -> Layer:
-    """Return columns `begin` to `end` of a row."""
-    return Layer(
-        "slice",
-        c=f"EACH memmove(X, X + {begin}, sizeof(float) * ({end} - {begin}));",
-        torch=lambda x, *_: x[:, begin:end],
-        numbers=(("begin", begin), ("end", end)),
-    )
-
-
-def convolution(weight: Floats, bias: Floats, shape: tuple[int, int, int], side: int, stride: int) -> Layer:
-    """Return a filter at every `stride`-th place of pictures of a shape (channels, rows, columns)."""
-    (channels, rows, columns), outputs = shape, bias.size
-    _, high, wide = convolved(shape, outputs, side, stride)
-    filters = (outputs, channels, side, side)
-    return Layer(
-        "convolution",
-        c=f"EACH convolve(w0, w1, {channels}, {rows}, {columns}, {side}, {stride}, {outputs}, X, Y);\nSWAP;",
-        torch=lambda x, w, _: F.conv2d(x.unflatten(1, shape), w[0].T.reshape(filters), w[1], stride).flatten(1),
-        arrays=(weight, bias),
-        numbers=(("channels", channels), ("rows", rows), ("columns", columns), ("side", side), ("stride", stride)),
-        width=outputs * high * wide,
-    )
-
-
-def convolved(shape: tuple[int, int, int], outputs: int, side: int, stride: int) -> tuple[int, int, int]:
-    """Return channels, rows and columns that a convolution makes of a picture."""
-    return outputs, (shape[1] - side) // stride + 1, (shape[2] - side) // stride + 1
-
-
-def global_max_pool(channels: int, places: int) -> Layer:
-    """Return the largest number of each channel: [channels x places] to [channels]."""
-    return Layer(
-        "global_max_pool",
-        c=f"EACH global_max_pool({channels}, {places}, X, Y);\nSWAP;",
-        torch=lambda x, *_: x.unflatten(1, (channels, places)).amax(2),
-        numbers=(("channels", channels), ("places", places)),
-    )
-
-
-def aggregate(begin: int, team: int, width: int, reach_squared: float) -> Layer:
-    """Return own features x beside the neighbours' mean message: [x, mean relative position / reach, mean of their x].
-
-    The observation holds others' relative positions from column `begin` on, two numbers each, in team order. Neighbours
-    have a squared distance below `reach_squared`. Means divide by their number plus one, for the agent itself.
-    """
-    others, reach, index = team - 1, math.sqrt(reach_squared), others_of(team)
-
-    def hear(x: Tensor, _: Any, observation: Tensor) -> Tensor:
-        ways = observation[:, begin : begin + 2 * others].unflatten(1, (others, 2))
-        near = (ways.square().sum(2, keepdim=True) < reach_squared).float()
-        share = near / (1 + near.sum(1, keepdim=True))  # [rows, N - 1, 1]
-        own = torch.arange(x.shape[0])  # rows and not worlds: an archive with a number of worlds takes no single one
-        messages = x[(own - own % team).unsqueeze(1) + torch.tensor(index)[own % team]]
-        return torch.cat([x, (share * (ways / reach)).sum(1), (share * messages).sum(1)], 1)
-
-    return Layer(
-        "aggregate",
-        c=f"aggregate(observation + {begin}, {width}, {literal(reach_squared)}, {literal(reach)}, x, y);\nSWAP;",
-        torch=hear,
-        numbers=(("begin", begin), ("team", team), ("width", width), ("reach_squared", reach_squared)),
-    )
-
-
-def literal(value: float) -> str:
-    """Return a float32 in C in full: nine digits tell every one apart."""
-    text = f"{value:.9g}"
-    return f"{text}f" if "." in text or "e" in text else f"{text}.0f"
