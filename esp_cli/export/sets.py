@@ -45,12 +45,12 @@ def pool_sets(
     """
     features, num_own = len(sets[0].arrays[-1]), own[1].size if own else len(kept)
     outputs = num_own + 2 * features * len(sets) + beside
-    said = {"kept": [*kept], "inputs": inputs, "near": near, "embeds_own": bool(own)}
+    said = {"kept": list(kept), "inputs": inputs, "near": near, "embeds_own": bool(own)}
     structure = [(each.name, each.place, each.reader) for each in sets]
 
     def pooled(x: Tensor, w: list[Tensor], tables: Mapping[str, Tensor]) -> Tensor:
         weights, act = iter(w[len(own) :]), torch.relu if kind == "relu" else torch.tanh
-        seen = x[:, said["kept"]]
+        seen = x[:, list(kept)]
         seen = act(torch.addmm(w[1], seen, w[0])) if own else seen
         things = []
         for name, place, reader in structure:

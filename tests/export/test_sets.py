@@ -51,6 +51,18 @@ def test_features_of_things_by_hand(near: int, expected: list[float], tmp_path: 
         np.testing.assert_allclose(run(sample_of(own, sets))[1], [expected] * 2, rtol=1e-6)
 
 
+@pytest.mark.skipif(c_file.compiler() is None, reason="needs a C compiler")
+def test_a_set_of_things_without_a_place_compiles(tmp_path: Path) -> None:
+    one, zero = np.ones((1, 1), np.float32), np.zeros(1, np.float32)
+    marks = SetOf("to read", ((1,), (2,)), place=None, reader=None, arrays=(one, 0 * one, zero, one, zero))
+    layer = pool_sets([marks], (), [0], inputs=1, beside=0, near=0, kind="relu")
+    program = Program(1, (layer,), 3, 0, 0, "choose", (), own=(0,), sets=(("to read", marks.columns),))
+    for name, source in c_source(program, "").items():
+        (tmp_path / name).write_bytes(source)
+    sample = sample_of(*program.split(np.array([[7, 2, 4]], np.float32)))
+    assert c_runner(tmp_path / "policy.c", program)(sample)[1].tolist() == [[7, 3, 4]]
+
+
 @pytest.mark.parametrize("near", [0, 2])
 def test_an_export_acts_with_any_number(near: int, tmp_path: Path) -> None:
     trained = drawn_policy("sets", near=near)
