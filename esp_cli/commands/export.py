@@ -20,7 +20,7 @@ EPILOG = """Examples:\n
     esp export formation -f c -o formation-c\n
     esp export runs/cn-mappo -f onnx -f numpy -o cn-export"""
 
-FORMATS = ("onnx", "c", "numpy")
+FORMATS = ("onnx", "torch", "c", "numpy")
 
 
 def export(
@@ -43,7 +43,7 @@ def export(
     force: options.ForceOption = False,
     json: options.JsonOption = None,
 ) -> None:
-    """Write a policy for other programs (ONNX, C99, numpy), checked against the policy itself.
+    """Write a policy for other programs (ONNX, torch.export, C99, numpy), checked against the policy itself.
 
     Every export has the layout and the units of its observation, the meaning of its actions, and a worked example.
     If the agents of a task have roles, each role's policy gets a folder.

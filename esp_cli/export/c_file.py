@@ -27,6 +27,7 @@ def c_source(program: Program, comment: str) -> dict[str, bytes]:
     """Write a program as a source and a header that begins with a comment."""
     values = {
         "program": program,
+        "returns": _returns(program),
         "comment": comment.replace("*/", "* /").replace("/*", "/ *").splitlines(),
         "sets": named(name for name, _ in program.sets).values(),
         "layers": [re.sub(r"\bw(\d+)\b", rf"w{k}_\1", layer.c) for k, layer in enumerate(program.layers)],
@@ -43,7 +44,13 @@ def c_source(program: Program, comment: str) -> dict[str, bytes]:
 def example_source(program: Program, example: dict[str, Any]) -> bytes:
     """Return a program that acts on the worked example, and says whether it acts as it should."""
     sets = {name: example["sets"][given] for given, name in named(example.get("sets", ())).items()}
-    return filled("policy_example.c", program=program, example=example, sets=sets, numbers=numbers)
+    given = {"program": program, "returns": _returns(program), "example": example, "sets": sets}
+    return filled("policy_example.c", **given, numbers=numbers)
+
+
+def _returns(program: Program) -> bool:
+    """Whether the function that acts returns the action, a single choice; else it writes it."""
+    return program.head == "choose" and program.team == 1
 
 
 def numbers(values: Any) -> str:
@@ -83,25 +90,26 @@ def _compiled(made: Path, *arguments: str | Path) -> Path:
 
 
 def c_runner(file: Path, program: Program) -> Runner:
-    """Compile a written C source and call it row by row."""
+    """Compile a written C source and call it row by row, or of a team world by world."""
     code = ctypes.CDLL(str(_compiled(file.with_suffix(".so"), "-shared", "-fPIC", file)))
-    choose, width = program.head == "choose", program.num_outputs
+    returns, team, width = _returns(program), program.team, program.num_outputs
     code.esp_policy_outputs.restype = ctypes.POINTER(ctypes.c_float)
-    code.esp_policy_act.restype = ctypes.c_int if choose else None
+    code.esp_policy_act.restype = ctypes.c_int if returns else None
 
     def run(sample: Sample) -> tuple[Numbers, Numbers, Numbers]:
         obs, after = np.ascontiguousarray(sample.obs), sample.memory.copy()
         outputs = np.empty((len(obs), width), np.float32)
-        action: Numbers = np.empty(len(obs), np.intc) if choose else np.empty_like(outputs)
+        action: Numbers = np.empty(len(obs), np.intc) if program.head == "choose" else np.empty_like(outputs)
         tables = [np.ascontiguousarray(table) for table in sample.sets.values()]
         arrays: list[Numbers] = [] if sample.mask is None else [sample.mask.astype(np.uint8)]
-        arrays += [after] * (program.memory_width > 0) + [action] * (not choose)
-        for k in range(len(obs)):
-            given = [part for table in tables for part in (table[k].ctypes, table.shape[1])]
-            chosen = code.esp_policy_act(obs[k].ctypes, *given, *(array[k].ctypes for array in arrays))
-            if choose:
+        arrays += [after] * (program.memory_width > 0) + [action] * (not returns)
+        for k in range(0, len(obs), team):
+            given = [part for table in tables for part in (table[k:].ctypes, table.shape[1])]
+            chosen = code.esp_policy_act(obs[k:].ctypes, *given, *(array[k:].ctypes for array in arrays))
+            if returns:
                 action[k] = chosen
-            outputs[k] = np.ctypeslib.as_array(code.esp_policy_outputs(), (width,))
+            for i in range(team):
+                outputs[k + i] = np.ctypeslib.as_array(code.esp_policy_outputs(*[i] * (team > 1)), (width,))
         return action, outputs, after
 
     return run

@@ -18,8 +18,9 @@ EXPORT_FORMAT, EXPORT_VERSION = "esp-export", 1
 
 
 def describe(trained: TrainedPolicy, program: Program, sample: Sample) -> dict[str, Any]:
-    """Return what `policy.json` holds; the sample's first row is the worked example."""
+    """Return what `policy.json` holds; the sample's first row (of a team its first world) is the worked example."""
     config, spec, head = trained.config, trained.spec, trained.policy.head
+    first = slice(program.team) if program.team > 1 else 0
     # What builds observations from poses knows no compass.
     robot = {} if config.prior.effective().compass else task_class(config.task).robot
     std = {"latent_std": head.log_std[0].exp()[head.item].tolist()} if isinstance(head, BoundedGaussian) else {}
@@ -44,7 +45,7 @@ def describe(trained: TrainedPolicy, program: Program, sample: Sample) -> dict[s
         "observation": _fields(spec.observation),
         "action": _action(spec),
         "memory": {"hidden": program.hidden, "previous_action": program.previous},
-        "example": {name: array[0].tolist() for name, array in rows.items() if array is not None}
+        "example": {name: array[first].tolist() for name, array in rows.items() if array is not None}
         | ({"sets": {name: table[0].tolist() for name, table in sample.sets.items()}} if sample.sets else {}),
     }
 

@@ -60,15 +60,15 @@ class Agreement:
 @torch.no_grad()
 def take_sample(trained: TrainedPolicy, program: Program, count: int = OBSERVATIONS) -> Sample:
     """Let one seed's policy act: one half on observations that it meets in its task, one half on random ones."""
-    obs, memory, mask = _play(trained, count // 2)
-    missing, rng = count - len(obs), np.random.default_rng(0)
-    obs = torch.cat([obs, torch.from_numpy(rng.standard_normal((missing, obs.shape[1]), np.float32))])
-    drawn = rng.uniform(-1, 1, (missing, program.memory_width)).astype(np.float32)
+    half, rng = math.ceil(count / 2 / program.team) * program.team, np.random.default_rng(0)  # whole worlds of a team
+    obs, memory, mask = _play(trained, half)
+    obs = torch.cat([obs, torch.from_numpy(rng.standard_normal((half, obs.shape[1]), np.float32))])
+    drawn = rng.uniform(-1, 1, (half, program.memory_width)).astype(np.float32)
     if program.previous and program.head == "choose":
-        drawn[:, program.hidden :] = np.eye(program.previous)[rng.integers(program.previous, size=missing)]
+        drawn[:, program.hidden :] = np.eye(program.previous)[rng.integers(program.previous, size=half)]
     memory = torch.cat([memory, torch.from_numpy(drawn)])
     if mask is not None:
-        mask = torch.cat([mask, torch.from_numpy(rng.random((missing, program.num_outputs)) < 0.6)])
+        mask = torch.cat([mask, torch.from_numpy(rng.random((half, program.num_outputs)) < 0.6)])
     allowed = None if mask is None else mask[None, None]
     action, after = trained.policy.act(obs[None, None], memory[None], action_mask=allowed)
     hidden, previous = memory.split([program.hidden, program.previous], 1)

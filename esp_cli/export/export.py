@@ -19,6 +19,7 @@ from esp_cli.export.numpy_file import numpy_runner, numpy_source
 from esp_cli.export.onnx_file import onnx_model, onnx_runner
 from esp_cli.export.program import Program, program_of
 from esp_cli.export.templates import RUNTIME, filled
+from esp_cli.export.torch_file import torch_archive, torch_runner
 from esp_cli.files.writing import remove_file, replace_file
 from esp_cli.policies.loading import TrainedPolicy
 from esp_envs.errors import UserError
@@ -88,6 +89,10 @@ FORMATS = {
     "onnx": Format(
         lambda job: {"policy.onnx": onnx_model(job.program, json.dumps(job.description))},
         lambda folder, _: onnx_runner(folder / "policy.onnx"),
+    ),
+    "torch": Format(
+        lambda job: {"policy.pt2": torch_archive(job.program, json.dumps(job.description))},
+        lambda folder, _: torch_runner(folder / "policy.pt2"),
     ),
     "c": Format(_c, lambda folder, program: c_file.c_runner(folder / "policy.c", program)),
     "numpy": Format(_numpy, lambda folder, _: numpy_runner(folder / "policy.py")),

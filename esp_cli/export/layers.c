@@ -31,6 +31,51 @@ static void normalise(const float *weight, const float *bias, int width, float *
     for (k = 0; k < width; k++) x[k] = (x[k] - mean) * scale * weight[k] + bias[k];
 }
 
+static void convolve(const float *weight, const float *bias, int channels, int rows, int columns,
+                     int side, int stride, int outputs, const float *x, float *y)
+{
+    const int wide = (columns - side) / stride + 1, places = ((rows - side) / stride + 1) * wide;
+    int place, out, i, j;
+    for (place = 0; place < places; place++) {
+        const float *corner = x + (place / wide * columns + place % wide) * stride;
+        for (out = 0; out < outputs; out++) {
+            float *sum = y + out * places + place;
+            *sum = bias[out];
+            for (i = 0; i < channels * side; i++) {
+                const float *pixels = corner + (i / side * rows + i % side) * columns;
+                for (j = 0; j < side; j++) *sum += pixels[j] * weight[(i * side + j) * outputs + out];
+            }
+        }
+    }
+}
+
+static void global_max_pool(int channels, int places, const float *x, float *y)
+{
+    int k;
+    for (k = 0; k < channels * places; k++) {
+        float *most = y + k / places;
+        if (k % places == 0 || x[k] > *most || x[k] != x[k]) *most = x[k]; /* NaN stays */
+    }
+}
+
+static void aggregate(const float *ways, int width, float reach_squared, const float *x, float *y)
+{
+    int i, j, k;
+    for (i = 0; i < AGENTS; i++, ways += ESP_POLICY_OBSERVATION) {
+        float *way = y + i * ROW + width, *received = way + 2, count = 1.0f;
+        memcpy(y + i * ROW, x + i * ROW, sizeof(float) * width);
+        for (k = 0; k < width + 2; k++) way[k] = 0.0f;
+        for (j = 0; j < AGENTS; j++) {
+            const float *to = ways + 2 * (j < i ? j : j - 1);
+            if (j == i || !(to[0] * to[0] + to[1] * to[1] < reach_squared)) continue;
+            count += 1.0f;
+            for (k = 0; k < 2; k++) way[k] += to[k] / sqrtf(reach_squared);
+            for (k = 0; k < width; k++) received[k] += x[j * ROW + k];
+        }
+        for (k = 0; k < width + 2; k++) way[k] /= count;
+    }
+}
+
 static float apart(const float *a, const float *b)
 {
     return (a[0] - b[0]) * (a[0] - b[0]) + (a[1] - b[1]) * (a[1] - b[1]);

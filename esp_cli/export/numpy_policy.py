@@ -8,7 +8,7 @@ import numpy as np
 
 
 class NumpyPolicy:
-    """One greedy policy; every row of observations is an agent of its own.
+    """One greedy policy; every row of observations is an agent of its own, or those of a team stand side by side.
 
     Args:
         program: layers and head.
@@ -31,7 +31,7 @@ class NumpyPolicy:
             raise ValueError("the weights do not fit the layers; export the policy again")
 
     def act(self, obs: Any, action_mask: Any = None, sets: Any = None) -> Any:
-        """Return the actions [...] or [..., width] of agents that see obs [..., D].
+        """Return the actions [...] or [..., width] of agents that see obs [..., D], a team's [..., N, D].
 
         A policy with masks needs the allowed actions [..., A], too; one over sets tables of their things [..., K, W] by
         name.
@@ -59,13 +59,15 @@ class NumpyPolicy:
         x, memory = np.asarray(obs, np.float32), np.asarray(memory, np.float32)
         if x.shape[-1:] != (self.program["num_inputs"],):
             raise ValueError(f"the observation has shape {x.shape}, but (..., {self.program['num_inputs']}) is needed")
+        if (team := self.program["team"]) > 1 and (x.ndim < 2 or x.shape[-2] % team):
+            raise ValueError(f"the observation has shape {x.shape}, but (..., {team}, D) is needed")
         if memory.shape != (*x.shape[:-1], self.hidden + self.previous):
             raise ValueError(f"the memory has shape {memory.shape}, but initial_memory{x.shape[:-1]} is needed")
         sets = self._tables(sets or {}, x.shape[:-1])
         hidden = memory[..., : self.hidden]
-        x = np.concatenate([x, memory[..., self.hidden :]], -1)
+        obs, x = x, np.concatenate([x, memory[..., self.hidden :]], -1)
         for layer, arrays in self.layers:
-            x = LAYERS[layer["kind"]](x, layer, arrays, {"gru": hidden, "sets": sets}.get(layer["kind"]))
+            x = LAYERS[layer["kind"]](x, layer, arrays, {"gru": hidden, "sets": sets}.get(layer["kind"], obs))
             hidden = x if layer["kind"] == "gru" else hidden
         return x, hidden
 
@@ -117,6 +119,28 @@ def _normalise(x: Any, _: dict[str, Any], arrays: list[Any], __: Any) -> Any:
     return x * arrays[0] + arrays[1]
 
 
+def _convolve(x: Any, layer: dict[str, Any], arrays: list[Any], _: Any) -> Any:
+    """Apply filters to rows that hold pictures, channels first."""
+    side, stride = layer["side"], layer["stride"]
+    shape = [layer["channels"], layer["rows"], layer["columns"]]
+    pictures = x[..., layer["begin"] : layer["begin"] + int(np.prod(shape))].reshape(*x.shape[:-1], *shape)
+    windows = np.lib.stride_tricks.sliding_window_view(pictures, (side, side), (-2, -1))[..., ::stride, ::stride, :, :]
+    places = windows.shape[-4] * windows.shape[-3]
+    patches = np.moveaxis(windows, -5, -3).reshape(*x.shape[:-1], places, len(arrays[0]))
+    return np.swapaxes(patches @ arrays[0] + arrays[1], -1, -2).reshape(*x.shape[:-1], places * len(arrays[1]))
+
+
+def _aggregate(x: Any, layer: dict[str, Any], _: list[Any], obs: Any) -> Any:
+    """Concatenate own features with the neighbours' mean relative position and mean message."""
+    team, reach_squared = layer["team"], np.float32(layer["reach_squared"])
+    ways = obs[..., layer["begin"] : layer["begin"] + 2 * (team - 1)].reshape(*obs.shape[:-1], team - 1, 2)
+    near = ((ways * ways).sum(-1, keepdims=True) < reach_squared).astype(np.float32)
+    share = near / (1 + near.sum(-2, keepdims=True))  # [..., N, N - 1, 1]
+    others = [[j for j in range(team) if j != i] for i in range(team)]
+    heard = x.reshape(-1, team, x.shape[-1])[:, others].reshape(*ways.shape[:-1], x.shape[-1])
+    return np.concatenate([x, (share * (ways / np.sqrt(reach_squared))).sum(-2), (share * heard).sum(-2)], -1)
+
+
 def _pool_sets(x: Any, layer: dict[str, Any], arrays: list[Any], tables: Any) -> Any:
     """Concatenate own numbers with mean and maximum over the embedded things of each set."""
     act = np.tanh if layer["activation"] == "tanh" else lambda x: np.maximum(x, 0)
@@ -155,6 +179,9 @@ LAYERS = {
     "tanh": lambda x, *_: np.tanh(x),
     "norm": _normalise,
     "gru": _recur,
+    "convolution": _convolve,
+    "global_max_pool": lambda x, layer, *_: x.reshape(*x.shape[:-1], layer["channels"], layer["places"]).max(-1),
+    "aggregate": _aggregate,
     "sets": _pool_sets,
 }
-"""What a layer makes of rows x [..., width], with its arrays and what it asks for: a hidden state, or tables."""
+"""What a layer makes of rows x [..., width], with its arrays and the observations, or hidden state, or tables."""

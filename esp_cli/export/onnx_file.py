@@ -10,75 +10,16 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
 
 from esp_cli.defaults import __version__
 from esp_cli.export.check import Numbers, Runner, Sample
 from esp_cli.export.program import Program
 from esp_cli.export.sets import named
-from esp_cli.networks.heads import masked, squash
+from esp_cli.export.torch_file import exported_program
 from esp_envs.errors import UserError
 from esp_envs.installed import install
 
 OPSET = 20  # the first with layer normalisation, and a maximum of flags; runtimes since 2023 read it
-
-
-class TorchProgram(nn.Module):
-    """The program in torch's own operations.
-
-    It takes observation [rows, D]; of recurrent policies memory [rows, H]; of those with masks action_mask [rows, A]
-    bool; of networks over sets tables [rows, K, W] by name. It returns action ([rows] int64 or [rows, width]), outputs
-    [rows, outputs] and, if recurrent, memory [rows, H].
-    """
-
-    def __init__(self, program: Program) -> None:
-        super().__init__()
-        self.program = program
-        for k, layer in enumerate(program.layers):
-            for i, array in enumerate(layer.arrays):
-                self.register_buffer(f"w{k}_{i}", torch.from_numpy(array.copy()))
-        self.disc = torch.block_diag(*(torch.ones(width, width) for width in program.groups or (1,)))
-
-    def forward(
-        self,
-        observation: Tensor,
-        memory: Tensor | None = None,
-        action_mask: Tensor | None = None,
-        sets: dict[str, Tensor] | None = None,
-    ) -> tuple[Tensor, ...]:
-        program, x = self.program, observation
-        hidden = x[:, :0] if memory is None else memory[:, : program.hidden]
-        if program.previous and memory is not None:
-            x = torch.cat([x, memory[:, program.hidden :]], 1)
-        for k, layer in enumerate(program.layers):
-            arrays = [self.get_buffer(f"w{k}_{i}") for i in range(len(layer.arrays))]
-            x = layer.torch(x, arrays, {"gru": hidden, "sets": sets}.get(layer.kind))
-            hidden = x if layer.kind == "gru" else hidden
-        if program.head == "choose":
-            action = masked(x, action_mask).argmax(-1)
-            encoded = nn.functional.one_hot(action, program.num_outputs).float()
-        else:
-            action = encoded = squash(x, self.disc)
-        if memory is None:
-            return action, x
-        return action, x, torch.cat([hidden, encoded], 1) if program.previous else hidden
-
-
-def exported_program(program: Program) -> torch.export.ExportedProgram:
-    """Return a program as a graph of plain operations, for any number of rows."""
-    rows = torch.export.Dim("rows", min=1)
-    inputs = {"observation": torch.zeros(2, program.num_inputs)}
-    if program.memory_width:
-        inputs["memory"] = torch.zeros(2, program.memory_width)
-    named = dict[str, Any]()
-    if program.masked:
-        named["action_mask"] = torch.ones(2, program.num_outputs, dtype=torch.bool)
-    shapes: dict[str, Any] = {name: {0: rows} for name in inputs | named}
-    if program.sets:
-        widths = {name: len(columns[0]) for name, columns in program.sets}
-        named["sets"] = {name: torch.zeros(2, 3 + k, width) for k, (name, width) in enumerate(widths.items())}
-        shapes["sets"] = {name: {0: rows, 1: torch.export.Dim(f"things{k}")} for k, name in enumerate(widths)}
-    return torch.export.export(TorchProgram(program).eval(), (*inputs.values(),), named, dynamic_shapes=shapes)
 
 
 def library(name: str) -> Any:
@@ -95,7 +36,7 @@ def onnx_model(program: Program, description: str) -> bytes:
 
     Inputs: `observation` [rows, D]; of a recurrent policy `memory` [rows, H]; of one with masks `action_mask` [rows, A]
     bool; of a network over sets `set_NAME` [rows, K, W]. Outputs: `action` ([rows] int64 or [rows, width] float32),
-    `outputs` [rows, outputs] of the last layer, and `memory_out` [rows, H].
+    `outputs` [rows, outputs] of the last layer, and `memory_out` [rows, H]. A team's rows stand side by side.
 
     The description, which is JSON, goes into the model's metadata.
     """

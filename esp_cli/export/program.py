@@ -7,8 +7,9 @@ A program maps a row of observation, and of memory where it has one, to outputs,
     action = argmax(x)                     head `choose`, among the allowed actions where the task has masks; or
     action = u tanh|u| / |u|               head `squash`, for each group u of x: a planar vector, or a single number
 
-The memory is [hidden state of the unit, previous action], the latter one-hot where it is a choice. Of a network over
-sets the observation is the own numbers, and each set comes as a table of its things, as many as there are.
+The memory is [hidden state of the unit, previous action], the latter one-hot where it is a choice. Of a team, whose
+agents exchange messages, the rows of a world's agents are adjacent. Of a network over sets the observation is the own
+numbers, and each set comes as a table of its things, as many as there are.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from esp_cli.networks.contract import Network
 from esp_cli.networks.exploration import BoundedPoint, EpsilonGreedy, ExploringCategorical
 from esp_cli.networks.heads import BoundedGaussian, Categorical
 from esp_cli.networks.layers import SeedLayerNorm, SeedLinear, SeedMLP
+from esp_cli.networks.message_passing import REACH_SQUARED, MessagePassing
 from esp_cli.networks.plain import GRU, MLP
 from esp_cli.networks.policy import HistoryPolicy, Policy
 from esp_cli.networks.sets import RecurrentSetNetwork, SetNetwork
@@ -46,6 +48,7 @@ class Program:
     previous: int  # numbers of the previous action in the memory
     head: Literal["choose", "squash"]  # how the outputs become an action
     groups: Sequence[int]  # widths of what is squashed together; empty where the head chooses
+    team: int = 1  # agents that act together, with their rows side by side; 1 where each acts by itself
     masked: bool = False  # whether a mask of allowed actions [A] comes along; one that allows none allows all
     # of a network over sets: where a task's observation has the own numbers, and each set's things with their numbers
     own: Sequence[int] = ()
@@ -88,9 +91,12 @@ def program_of(policy: Policy, masked: bool = False) -> Program:
         groups = head.disc.argmax(1).unique(return_counts=True)[1].tolist()
     elif not isinstance(head, Categorical | ExploringCategorical | EpsilonGreedy):
         raise UserError(f"a head of the kind {type(head).__name__} cannot be exported")
-    read = (
-        len(sets["own"]) if sets else next(len(layer.arrays[0]) for layer in own if layer.kind == "affine") - previous
-    )
+    if isinstance(actor, MessagePassing):
+        read = max(actor.picture.stop, actor.others.stop)
+    elif sets:
+        read = len(sets["own"])
+    else:
+        read = next(len(layer.arrays[0]) for layer in own if layer.kind == "affine") - previous
     return Program(
         num_inputs=read,
         layers=(*own, *sums),
@@ -99,6 +105,7 @@ def program_of(policy: Policy, masked: bool = False) -> Program:
         previous=previous,
         head="squash" if groups else "choose",
         groups=groups,
+        team=actor.team,
         masked=masked,
         **sets,
     )
@@ -111,9 +118,11 @@ def _network(actor: Network) -> list[Layer]:
         norm = [_norm(actor.norm)] if isinstance(actor.norm, SeedLayerNorm) else []
         unit = layers.gru(*_arrays(actor.gru.input), *_arrays(actor.gru.recurrent))
         return [*_perceptron(actor.body), unit, *norm, _affine(actor.head)]
+    if isinstance(actor, MessagePassing):
+        return _message_passing(actor)
     raise UserError(
-        f"a network of the kind {type(actor).__name__} cannot be exported; mlp, gru, set and equivariant can, without "
-        "symmetrise and order=nearest"
+        f"a network of the kind {type(actor).__name__} cannot be exported; mlp, gru, set, equivariant, mpn and empn "
+        "can, without symmetrise and order=nearest"
     )
 
 
@@ -140,6 +149,22 @@ def _sets(actor: SetNetwork | RecurrentSetNetwork, previous: int) -> tuple[list[
     features = pool_sets(sets, own, kept, len(columns), previous, rows.near, actor.activation)
     found = {"own": columns, "sets": [(each.name, each.columns) for each in sets]}
     return [features, *(_perceptron(actor.head) if isinstance(actor, SetNetwork) else _network(actor.unit))], found
+
+
+def _message_passing(actor: MessagePassing) -> list[Layer]:
+    encoder, own = actor.encoder, list[Layer]()
+    begin, shape = actor.picture.start, encoder.shape
+    for layer, side, stride in zip(encoder.layers, encoder.sides, encoder.strides, strict=True):
+        filters = layers.convolution(*_arrays(layer), begin, shape, side, stride)
+        own += [filters, layers.activation("relu", filters.width)]
+        begin, shape = 0, layers.convolved(shape, filters.arrays[1].size, side, stride)
+    own.append(layers.global_max_pool(shape[0], shape[1] * shape[2]))
+    for layer in actor.layers:
+        linear = _affine(layer)
+        inputs, outputs = linear.arrays[0].shape
+        hear = layers.aggregate(actor.others.start, actor.team, (inputs - 2) // 2, REACH_SQUARED)
+        own += [hear, linear, layers.activation("relu", outputs)]
+    return [*own, _affine(actor.head)]
 
 
 def _perceptron(mlp: SeedMLP | Equivariant) -> list[Layer]:

@@ -61,7 +61,7 @@ def test_the_folder_that_comes_along_is_listed() -> None:
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (["-f", "tflite"], "there is no format 'tflite'; the formats are onnx, c, numpy"),
+        (["-f", "tflite"], "there is no format 'tflite'; the formats are onnx, torch, c, numpy"),
         (["-f", "c", "--seed", "4"], "has no seed 4; it has 3, 7"),
         (["-f", "c", "--algo", "mappo"], "--algo and --prior choose among a task's policies"),
     ],

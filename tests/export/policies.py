@@ -26,6 +26,7 @@ KINDS = {
     "point, recurrent": ("navigation", "maddpg", {"network.name": "gru", "task.actions": "continuous"}),
     "point": ("formation", "maddpg", {}),
     "equivariant": ("navigation", "mappo", {"network.name": "equivariant"}),
+    "team": ("wildlife", "mappo", {}),
     "sets": ("navigation", "mappo", {"network.name": "set", "task.num_agents": 4}),
     "sets, recurrent": (
         "navigation",
@@ -36,9 +37,9 @@ KINDS = {
     "sets, near": ("predator-prey", "mappo", {"network.name": "set", "network.near": 2, "network.activation": "tanh"}),
 }
 """Every head, on a perceptron and on a recurrent network where they differ; every network."""
+LARGE = {"team, values, equivariant": ("wildlife", "qmix", {"network.name": "empn"})}
+"""Exported alike; a comparison on thousands of observations takes long."""
 REFUSED = {
-    "team": ("wildlife", "mappo", {}),
-    "team, values, equivariant": ("wildlife", "qmix", {"network.name": "empn"}),
     "ensemble": ("navigation", "mappo", {"network.symmetrise": "c4"}),
     "set-equivariant": ("navigation", "mappo", {"network.name": "set-equivariant"}),
 }
@@ -49,7 +50,7 @@ def drawn_policy(
     kind: str, seeds: tuple[int, ...] = (0,), hidden: tuple[int, ...] = (12, 10), near: int = 0, **of_task: object
 ) -> TrainedPolicy:
     """Return policies whose weights are large enough to matter: those of a new one give all actions the same chance."""
-    task, algorithm, settings = (KINDS | REFUSED)[kind]
+    task, algorithm, settings = (KINDS | LARGE | REFUSED)[kind]
     overrides = {
         **on_perceptron(task),
         "network.hidden": list(hidden),

@@ -29,10 +29,10 @@ def test_a_pilot_sees_from_poses_what_the_task_shows(case, tmp_path, monkeypatch
     assert len(scenes.poses) == len(scenes.observations) == states
     assert len(np.unique(scenes.poses[:, 0, 0])) > 0.99 * states, "states differ"
     monkeypatch.setattr(epuck, "take_scenes", lambda trained: scenes)
-    results = export(trained, ["numpy", "c"], tmp_path).formats
+    results = export(trained, ["numpy", "torch"], tmp_path).formats
     seen = {result.name: result.seen for result in results}
     assert 0 < seen["numpy"] < epuck.TOLERANCE
-    assert seen["c"] is None
+    assert seen["torch"] is None
     assert (tmp_path / "esp_epuck.py").is_file()
     assert "Observations built from poses were compared" in (tmp_path / "README.md").read_text()
 

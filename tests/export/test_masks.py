@@ -4,16 +4,21 @@ import json
 import re
 import runpy
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from esp_cli.export import c_file, onnx_file
-from esp_cli.export.check import compare, take_sample
+from esp_cli.export.c_file import c_runner, c_source
+from esp_cli.export.check import Sample, compare, take_sample
 from esp_cli.export.export import export
 from esp_cli.export.numpy_policy import NumpyPolicy
+from esp_cli.export.onnx_file import onnx_model, onnx_runner
 from esp_cli.export.program import program_of
+from esp_cli.export.torch_file import TorchProgram
 from esp_envs import register
 from esp_envs.registry import TASKS
 from tests.export.policies import KINDS, drawn_policy
@@ -38,7 +43,7 @@ def registered(monkeypatch: pytest.MonkeyPatch) -> None:
 @needs_cc
 @pytest.mark.parametrize("kind", MASKED)
 def test_exports_choose_among_allowed_actions_as_the_policy_does(kind, tmp_path, monkeypatch):
-    results = export(drawn_policy(kind), ("numpy", "c", "onnx"), tmp_path).formats
+    results = export(drawn_policy(kind), ("numpy", "c", "onnx", "torch"), tmp_path).formats
     for result in results:
         assert result.agreement is not None
         assert result.agreement.observations == 10_000
@@ -59,6 +64,10 @@ def _run_calls(page: str, example: dict) -> None:
     for call in re.findall(r"`([^`]* = policy\.[^`]*)`", page):
         exec(call, scope)  # noqa: S102 - the export's own lines
     assert scope["action"].tolist() == [example["action"]]
+    (call,) = re.findall(r"`(torch\.export[^`]*)`", page)
+    given = {"torch": torch} | {name: torch.from_numpy(array) for name, array in rows.items()}
+    action = eval(call, given)[0]  # noqa: S307 - likewise
+    assert action.tolist() == [example["action"]]
     (told,) = re.findall(r"Inputs: (.*); outputs", page)
     read = {name: rows[name] for name in re.findall(r"`(\w+)`", told)}
     session = onnx_file.library("onnxruntime").InferenceSession("policy.onnx", providers=["CPUExecutionProvider"])
@@ -86,3 +95,25 @@ def test_a_mask_is_asked_for_and_has_a_shape() -> None:
     with pytest.raises(ValueError, match="no action masks"):
         free.act(obs, np.ones((2, 5), bool))
     assert policy.act(obs, np.zeros((2, 5), bool)).tolist() == free.act(obs).tolist(), "none allowed: all are"
+
+
+@needs_cc
+@torch.no_grad()
+def test_agents_that_exchange_messages_choose_among_allowed_actions(tmp_path: Path) -> None:
+    program = program_of(drawn_policy("team").policy, masked=True)
+    rng = np.random.default_rng(0)
+    rows = rng.standard_normal((6 * program.team, program.num_inputs)).astype(np.float32)
+    memory = np.zeros((len(rows), 0), np.float32)
+    mask = rng.random((len(rows), program.num_outputs)) < 0.4
+    mask[0], mask[1] = False, [True, *[False] * (program.num_outputs - 1)]
+    for name, content in c_source(program, "").items():
+        (tmp_path / name).write_bytes(content)
+    (tmp_path / "policy.onnx").write_bytes(onnx_model(program, "{}"))
+    sample = Sample(rows, memory, mask, {}, memory, memory, memory)
+    action, outputs, _ = c_runner(tmp_path / "policy.c", program)(sample)
+    expected = np.where(mask | ~mask.any(-1, keepdims=True), outputs, -np.inf).argmax(-1)
+    assert action.tolist() == expected.tolist()
+    assert (action[0], action[1]) == (outputs[0].argmax(), 0)
+    assert onnx_runner(tmp_path / "policy.onnx")(sample)[0].tolist() == expected.tolist()
+    through_torch = TorchProgram(program)(torch.from_numpy(rows), action_mask=torch.from_numpy(mask))[0]
+    assert through_torch.tolist() == expected.tolist()

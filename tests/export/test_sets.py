@@ -13,14 +13,17 @@ from esp_cli.export.numpy_file import numpy_runner, numpy_source
 from esp_cli.export.onnx_file import onnx_model, onnx_runner
 from esp_cli.export.program import Program, program_of
 from esp_cli.export.sets import SetOf, pool_sets
+from esp_cli.export.torch_file import torch_archive, torch_runner
 from esp_envs.errors import UserError
 from tests.export.policies import drawn_policy
 
 
 def runners(program: Program, folder: Path) -> dict[str, Runner]:
+    (folder / "policy.pt2").write_bytes(torch_archive(program, "{}"))
     (folder / "policy.onnx").write_bytes(onnx_model(program, "{}"))
     (folder / "policy.py").write_bytes(numpy_source(program, "", {}))
-    made = {"onnx": onnx_runner(folder / "policy.onnx"), "numpy": numpy_runner(folder / "policy.py")}
+    made = {"torch": torch_runner(folder / "policy.pt2"), "onnx": onnx_runner(folder / "policy.onnx")}
+    made["numpy"] = numpy_runner(folder / "policy.py")
     if c_file.compiler() is not None:
         for name, source in c_source(program, "").items():
             (folder / name).write_bytes(source)
@@ -95,5 +98,5 @@ def test_the_python_file_refuses_tables_that_do_not_fit(tmp_path: Path) -> None:
 
 
 def test_the_equivariant_network_over_sets_is_refused() -> None:
-    with pytest.raises(UserError, match="DirectionActor cannot be exported; mlp, gru, set and equivariant"):
+    with pytest.raises(UserError, match="DirectionActor cannot be exported; mlp, gru, set, equivariant,"):
         program_of(drawn_policy("set-equivariant").policy)
