@@ -15,7 +15,6 @@ from esp_envs.registry import task_class
 from esp_envs.spec import Discrete, Layout, TaskSpec, describe_action
 
 EXPORT_FORMAT, EXPORT_VERSION = "esp-export", 1
-_MOST_ROWS = 16  # actions beyond which only `policy.json` lists them
 
 
 def describe(trained: TrainedPolicy, program: Program, sample: Sample) -> dict[str, Any]:
@@ -47,23 +46,18 @@ def describe(trained: TrainedPolicy, program: Program, sample: Sample) -> dict[s
         "action": _action(spec),
         "memory": {"hidden": program.hidden, "previous_action": program.previous},
         "example": {name: array[first].tolist() for name, array in rows.items() if array is not None}
-        | ({"sets": {name: table[first].tolist() for name, table in sample.sets.items()}} if sample.sets else {}),
+        | ({"sets": {name: table[0].tolist() for name, table in sample.sets.items()}} if sample.sets else {}),
     }
 
 
 def _fields(layout: Layout) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
-    for row, parts in zip(layout.table(), _parts(layout), strict=True):
-        rows.append(
-            dict(zip(("index", "field", "kind", "unit"), row, strict=True)) | ({"parts": parts} if parts else {})
-        )
+    for row, field in zip(layout.table(), layout.fields, strict=True):
+        rows.append(dict(zip(("index", "field", "kind", "unit"), row, strict=True)))
+        parts = getattr(field.kind, "parts", ())  # what its numbers are called, as joints are
+        if set(parts) - {field.name}:
+            rows[-1]["parts"] = parts
     return rows
-
-
-def _parts(layout: Layout) -> list[tuple[str, ...]]:
-    """Return for each field what its numbers are called, as joints are."""
-    named = [tuple(getattr(field.kind, "parts", ())) for field in layout.fields]
-    return [parts if set(parts) - {f.name} else () for f, parts in zip(layout.fields, named, strict=True)]
 
 
 def _action(spec: TaskSpec) -> dict[str, Any]:
@@ -74,60 +68,22 @@ def _action(spec: TaskSpec) -> dict[str, Any]:
     return {"bounds": [-1.0, 1.0], "fields": _fields(spec.action.layout)}
 
 
-def title(trained: TrainedPolicy) -> str:
-    """Return what the policy is in a line."""
-    config = trained.config
+def words(trained: TrainedPolicy, program: Program, description: dict[str, Any]) -> dict[str, Any]:
+    """Return what templates need to say what the policy is and what its numbers mean."""
+    config, spec = trained.config, trained.spec
     role = f", role {trained.role}" if trained.role else ""
     prior = "without prior" if config.prior.kind == "none" else f"with the prior {config.prior.kind}"
-    return (
-        f"{config.task} version {trained.spec.version}{role}: greedy policy of {config.algorithm} {prior}, seed "
-        f"{config.seeds[0]}, {trained.step} environment steps"
-    )
-
-
-def summary(trained: TrainedPolicy, program: Program) -> str:
-    """Return title, layouts and memory as plain lines, for the top of a source file."""
-    return "\n".join([f"{title(trained)}.", f"Written by esp {__version__}.", "", *spaces(trained.spec, program)])
-
-
-def spaces(spec: TaskSpec, program: Program) -> list[str]:
-    """Return layouts and memory as plain lines."""
-    lines = ["Observation of one agent (float32):", *_rows(spec.observation)]
-    if program.team > 1:
-        lines.append(
-            f"The {program.team} agents of a world exchange messages and act together: their rows are adjacent."
-        )
-    if program.sets:
-        names = ", ".join(f"{name} {len(columns[0])}" for name, columns in program.sets)
-        lines.append(
-            f"The policy takes the {program.num_inputs} own numbers as its observation, and beside them a table "
-            f"of each set, with a row for each thing, as many as there are, at least one; numbers of a row: {names}."
-        )
-    of_robot = any(hasattr(field.kind, "parts") for field in spec.observation.fields)
-    if not of_robot:  # whose numbers may be seen from its body
-        lines += ["The frame is the world's: x to the right, y up, angles counter-clockwise in radians."]
-    lines.append("Action of one agent:")
-    if isinstance(spec.action, Discrete):
-        lines.append(f"  the index of one of {spec.action.count} options, each a {spec.action.kind.name}:")
-        options = list(describe_action(spec.action))
-        lines += [f"  {name}: {means}" for name, means in options[:_MOST_ROWS]]
-        lines += ["  ... (the rest is in policy.json)"] if len(options) > _MOST_ROWS else []
-        if program.masked:
-            lines.append("A mask gives the allowed actions: action_mask, in C allowed. Where none is allowed, all are.")
-    else:
-        lines += [*_rows(spec.action.layout), "  each number in [-1, 1], planar vectors in the unit disc"]
-    lines.append(f"One action every {spec.control_period_s:g} s, the best one: exports do not explore.")
-    if program.memory_width:
-        lines.append(f"Memory of one agent: {program.memory_width} numbers, zeros when an episode begins.")
-    return lines
-
-
-def _rows(layout: Layout) -> list[str]:
-    rows = []
-    for (index, name, kind, unit), parts in zip(layout.table(), _parts(layout), strict=True):
-        names = f": {', '.join(parts[:_MOST_ROWS])}{', ...' if len(parts) > _MOST_ROWS else ''}" if parts else ""
-        rows.append(f"  {index:>7}  {name}: {kind}{f' ({unit})' if unit else ''}{names}")
-    return rows
+    return {
+        "title": f"{config.task} version {spec.version}{role}: greedy policy of {config.algorithm} {prior}, seed "
+        f"{config.seeds[0]}, {trained.step} environment steps",
+        "version": __version__,
+        "spec": spec,
+        "program": program,
+        "description": description,
+        "options": [f"{name}: {means}" for name, means in describe_action(spec.action)],
+        "most_rows": 16,  # beyond which only `policy.json` lists them
+        "of_robot": any(hasattr(field.kind, "parts") for field in spec.observation.fields),  # may be seen from its body
+    }
 
 
 def shortly(values: Any) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,33 +23,29 @@ TOLERANCE = 1e-4
 _STEPS = 50
 
 Numbers = NDArray[Any]
-Runner = Callable[..., tuple[Numbers, Numbers, Numbers]]
-"""(observation [B, D], memory [B, H], action mask [B, A] or None, tables [B, K, W] of sets by name where there are
-some) to (action [B] or [B, width], outputs [B, O], memory
-after [B, H])."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """What the policy itself does, row by row: observation, memory, outputs, action, next memory, allowed actions."""
+    """What the policy itself does, row by row."""
 
-    obs: Floats
-    memory: Floats
-    outputs: Floats
-    action: Numbers
-    after: Floats
-    mask: Numbers | None = None
-    sets: dict[str, Floats] = field(default_factory=dict)  # beside own numbers; see `Program`
-
-    def run(self, runner: Runner, obs: Floats) -> tuple[Numbers, Numbers, Numbers]:
-        """Run an export on observations as many as the sample's."""
-        return runner(obs, self.memory, self.mask, *([self.sets] if self.sets else []))
+    obs: Floats  # [B, D]
+    memory: Floats  # [B, H]
+    mask: Numbers | None  # [B, A] bool, the allowed actions; None allows all
+    sets: dict[str, Floats]  # [B, K, W] by name, beside own numbers; see `Program`
+    outputs: Floats  # [B, O]
+    action: Numbers  # [B] or [B, width]
+    after: Floats  # [B, H], the next memory
 
     @property
     def choosable(self) -> Floats:
         """Outputs as the policy chooses among them: those of forbidden actions are out of reach."""
         mask = None if self.mask is None else torch.from_numpy(self.mask)
         return masked(torch.from_numpy(self.outputs), mask).numpy()
+
+
+Runner = Callable[[Sample], tuple[Numbers, Numbers, Numbers]]
+"""What observation, memory, mask and sets of a sample come to: action, outputs and next memory."""
 
 
 @dataclass(frozen=True)
@@ -64,28 +60,23 @@ class Agreement:
 @torch.no_grad()
 def take_sample(trained: TrainedPolicy, program: Program, count: int = OBSERVATIONS) -> Sample:
     """Let one seed's policy act: one half on observations that it meets in its task, one half on random ones."""
-    obs, memory, mask = _play(trained, _whole(count // 2, program.team))
-    missing = _whole(count - len(obs), program.team)
-    rng = np.random.default_rng(0)
-    obs = torch.cat([obs, torch.from_numpy(rng.standard_normal((missing, obs.shape[1]), np.float32))])
-    drawn = rng.uniform(-1, 1, (missing, program.memory_width)).astype(np.float32)
+    half, rng = math.ceil(count / 2 / program.team) * program.team, np.random.default_rng(0)  # whole worlds of a team
+    obs, memory, mask = _play(trained, half)
+    obs = torch.cat([obs, torch.from_numpy(rng.standard_normal((half, obs.shape[1]), np.float32))])
+    drawn = rng.uniform(-1, 1, (half, program.memory_width)).astype(np.float32)
     if program.previous and program.head == "choose":
-        drawn[:, program.hidden :] = np.eye(program.previous)[rng.integers(program.previous, size=missing)]
+        drawn[:, program.hidden :] = np.eye(program.previous)[rng.integers(program.previous, size=half)]
     memory = torch.cat([memory, torch.from_numpy(drawn)])
     if mask is not None:
-        mask = torch.cat([mask, torch.from_numpy(rng.random((missing, program.num_outputs)) < 0.6)])
+        mask = torch.cat([mask, torch.from_numpy(rng.random((half, program.num_outputs)) < 0.6)])
     allowed = None if mask is None else mask[None, None]
     action, after = trained.policy.act(obs[None, None], memory[None], action_mask=allowed)
-    actor = trained.policy.actor  # its outputs before the head normalises them
-    hidden, previous = memory.split([actor.memory_width, memory.shape[1] - actor.memory_width], 1)
-    outputs = actor.step(torch.cat([obs, previous], 1)[None], hidden[None])[0][0]
-    masks = None if mask is None else mask.numpy()
+    hidden, previous = memory.split([program.hidden, program.previous], 1)
+    # its outputs before the head normalises them
+    outputs = trained.policy.actor.step(torch.cat([obs, previous], 1)[None], hidden[None])[0][0]
     own, sets = program.split(obs.numpy())
-    return Sample(own, memory.numpy(), outputs.numpy(), action[0, 0].numpy(), after[0].numpy(), masks, sets)
-
-
-def _whole(count: int, team: int) -> int:
-    return math.ceil(count / team) * team
+    masks = None if mask is None else mask.numpy()
+    return Sample(own, memory.numpy(), masks, sets, outputs.numpy(), action[0, 0].numpy(), after[0].numpy())
 
 
 def _play(trained: TrainedPolicy, count: int) -> tuple[Tensor, Tensor, Tensor | None]:
@@ -106,7 +97,7 @@ def _play(trained: TrainedPolicy, count: int) -> tuple[Tensor, Tensor, Tensor | 
 
 def compare(sample: Sample, runner: Runner) -> Agreement:
     """Compare an export with the policy."""
-    action, outputs, after = sample.run(runner, sample.obs)
+    action, outputs, after = runner(sample)
     largest = max(1.0, float(np.abs(sample.outputs).max()))
     gap = float(np.abs(outputs - sample.outputs).max())
     chooses, ties = sample.action.dtype.kind == "i", True

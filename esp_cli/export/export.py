@@ -12,11 +12,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import numpy as np
-
-from esp_cli.defaults import __version__
 from esp_cli.export import c_file, epuck
-from esp_cli.export.card import describe, shortly, spaces, summary, title
+from esp_cli.export.card import describe, shortly, words
 from esp_cli.export.check import Agreement, Runner, Sample, compare, take_sample
 from esp_cli.export.numpy_file import numpy_runner, numpy_source
 from esp_cli.export.onnx_file import onnx_model, onnx_runner
@@ -40,6 +37,7 @@ class Job:
     program: Program  # the same as plain arrays
     sample: Sample  # of what it does
     description: dict[str, Any]  # what `policy.json` holds
+    words: dict[str, Any]  # what templates say of it
     scenes: epuck.Scenes | None  # states of the task; None unless the policy can drive an e-puck
 
 
@@ -72,17 +70,19 @@ class Exported:
 
 
 def _c(job: Job) -> Files:
-    example = job.description["example"]
-    rows = (np.ravel(example.get(name, [])).tolist() for name in ("observation", "action", "action_mask"))
-    sets = example.get("sets", {})
-    source = c_file.c_source(job.program, summary(job.trained, job.program))
-    return source | {"policy_example.c": c_file.example_source(job.program, sets, *rows)}
+    example = {"policy_example.c": c_file.example_source(job.program, job.description["example"])}
+    return c_file.c_source(job.program, _summary(job)) | example
 
 
 def _numpy(job: Job) -> Files:
-    source = numpy_source(job.program, summary(job.trained, job.program), job.description)
+    source = numpy_source(job.program, _summary(job), job.description)
     beside = {} if job.scenes is None else {"esp_epuck.py": (RUNTIME / "esp_epuck.py").read_bytes()}
     return {"policy.py": source} | beside
+
+
+def _summary(job: Job) -> str:
+    """Return title, layouts and memory as plain lines, for the top of a source file."""
+    return filled("summary.txt", **job.words).decode().rstrip()
 
 
 FORMATS = {
@@ -103,7 +103,12 @@ FORMATS = {
 def export(trained: TrainedPolicy, formats: Sequence[str], folder: Path, force: bool = False) -> Exported:
     """Write one seed's policy in some formats, with `policy.json` and a README, after checking each."""
     formats = tuple(dict.fromkeys(formats))
-    job = _job(trained, formats)
+    program = program_of(trained.policy, trained.spec.masks)
+    sample = take_sample(trained, program)
+    description = describe(trained, program, sample)
+    drives = "robot" in description and "numpy" in formats and not program.memory_width
+    scenes = epuck.take_scenes(trained) if drives else None
+    job = Job(trained, program, sample, description, words(trained, program, description), scenes)
     files = {name: FORMATS[name].write(job) for name in formats}
     results = tuple(_checked(name, own, job) for name, own in files.items())
     written = {name: content for own in files.values() for name, content in own.items()}
@@ -111,15 +116,6 @@ def export(trained: TrainedPolicy, formats: Sequence[str], folder: Path, force: 
     written["README.md"] = _readme(job, results)
     _write(written, folder, force)
     return Exported(results, job.program.num_parameters)
-
-
-def _job(trained: TrainedPolicy, formats: Sequence[str]) -> Job:
-    program = program_of(trained.policy, trained.spec.masks)
-    sample = take_sample(trained, program)
-    description = describe(trained, program, sample)
-    drives = "numpy" in formats and not program.memory_width
-    robotic = drives and "robot" in description
-    return Job(trained, program, sample, description, epuck.take_scenes(trained) if robotic else None)
 
 
 def _write(files: Files, folder: Path, force: bool) -> None:
@@ -134,7 +130,6 @@ def _write(files: Files, folder: Path, force: bool) -> None:
         if name not in files:
             remove_file(folder / name)
     for name, content in files.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
         replace_file(folder / name, content)
 
 
@@ -146,7 +141,7 @@ def _checked(name: str, files: Files, job: Job) -> Export:
     with TemporaryDirectory(prefix="esp-export-") as scratch:
         folder = Path(scratch)
         for file, content in files.items():
-            (folder / Path(file).name).write_bytes(content)
+            (folder / file).write_bytes(content)
         agreement = compare(job.sample, form.run(folder, job.program))
         if name == "c" and not c_file.example_runs(folder):
             raise RuntimeError("the worked example of the exported C gives another action; this is a bug")
@@ -157,19 +152,13 @@ def _checked(name: str, files: Files, job: Job) -> Export:
 
 
 def _readme(job: Job, results: Sequence[Export]) -> bytes:
-    description, spec = job.description, job.trained.spec
-    robotic = job.scenes is not None
+    settings, example = job.trained.spec.settings, job.description["example"]
     return filled(
         "README.md",
-        title=title(job.trained),
-        version=__version__,
-        spaces="\n".join(spaces(spec, job.program)),
-        example=[(k, shortly(v)) for k, v in description["example"].items() if not k.startswith(("memory", "sets"))],
+        **job.words,
+        example=[(k, shortly(v)) for k, v in example.items() if not k.startswith(("memory", "sets"))],
         results=results,
-        spec=spec,
-        program=job.program,
         states=epuck.STATES,
-        robot=description["robot"] if robotic else None,
-        fields=[field["field"] for field in description["observation"]],
-        seen_robots=epuck.seen_robots(spec.settings) if robotic else 0,
+        robot=None if job.scenes is None else job.description["robot"],
+        seen_robots=0 if job.scenes is None else epuck.seen_robots(settings),
     )

@@ -34,20 +34,16 @@ static void normalise(const float *weight, const float *bias, int width, float *
 static void convolve(const float *weight, const float *bias, int channels, int rows, int columns,
                      int side, int stride, int outputs, const float *x, float *y)
 {
-    const int high = (rows - side) / stride + 1, wide = (columns - side) / stride + 1;
-    int out, row, column, channel, i, j;
-    for (out = 0; out < outputs; out++) {
-        for (row = 0; row < high; row++) {
-            for (column = 0; column < wide; column++) {
-                float sum = bias[out];
-                const float *w = weight + out;
-                for (channel = 0; channel < channels; channel++) {
-                    for (i = 0; i < side; i++) {
-                        const float *pixel = x + (channel * rows + row * stride + i) * columns + column * stride;
-                        for (j = 0; j < side; j++, w += outputs) sum += pixel[j] * *w;
-                    }
-                }
-                y[(out * high + row) * wide + column] = sum;
+    const int wide = (columns - side) / stride + 1, places = ((rows - side) / stride + 1) * wide;
+    int place, out, i, j;
+    for (place = 0; place < places; place++) {
+        const float *corner = x + (place / wide * columns + place % wide) * stride;
+        for (out = 0; out < outputs; out++) {
+            float *sum = y + out * places + place;
+            *sum = bias[out];
+            for (i = 0; i < channels * side; i++) {
+                const float *pixels = corner + (i / side * rows + i % side) * columns;
+                for (j = 0; j < side; j++) *sum += pixels[j] * weight[(i * side + j) * outputs + out];
             }
         }
     }
@@ -55,32 +51,28 @@ static void convolve(const float *weight, const float *bias, int channels, int r
 
 static void global_max_pool(int channels, int places, const float *x, float *y)
 {
-    int channel, place;
-    for (channel = 0; channel < channels; channel++) {
-        y[channel] = x[channel * places];
-        for (place = 1; place < places; place++) {
-            const float next = x[channel * places + place];
-            if (next > y[channel] || next != next) y[channel] = next; /* NaN stays */
-        }
+    int k;
+    for (k = 0; k < channels * places; k++) {
+        float *most = y + k / places;
+        if (k % places == 0 || x[k] > *most || x[k] != x[k]) *most = x[k]; /* NaN stays */
     }
 }
 
-static void aggregate(const float *ways, int width, float reach_squared, float reach, const float *x, float *y)
+static void aggregate(const float *ways, int width, float reach_squared, const float *x, float *y)
 {
     int i, j, k;
     for (i = 0; i < AGENTS; i++, ways += ESP_POLICY_OBSERVATION) {
-        float *own = y + i * ROW, *way = own + width, *received = way + 2, count = 1.0f;
-        memcpy(own, x + i * ROW, sizeof(float) * width);
+        float *way = y + i * ROW + width, *received = way + 2, count = 1.0f;
+        memcpy(y + i * ROW, x + i * ROW, sizeof(float) * width);
         for (k = 0; k < width + 2; k++) way[k] = 0.0f;
         for (j = 0; j < AGENTS; j++) {
             const float *to = ways + 2 * (j < i ? j : j - 1);
             if (j == i || !(to[0] * to[0] + to[1] * to[1] < reach_squared)) continue;
             count += 1.0f;
-            for (k = 0; k < 2; k++) way[k] += to[k];
+            for (k = 0; k < 2; k++) way[k] += to[k] / sqrtf(reach_squared);
             for (k = 0; k < width; k++) received[k] += x[j * ROW + k];
         }
-        for (k = 0; k < 2; k++) way[k] /= count * reach;
-        for (k = 0; k < width; k++) received[k] /= count;
+        for (k = 0; k < width + 2; k++) way[k] /= count;
     }
 }
 
@@ -149,6 +141,16 @@ static void recur(int width, const float *into, const float *back, float *hidden
         const float candidate = tanhf(into[2 * width + k] + reset * back[2 * width + k]);
         hidden[k] = candidate + update * (hidden[k] - candidate);
     }
+}
+
+/* Brings numbers into their bounds together: u tanh|u| / |u|. */
+static void squash(const float *x, int width, float *action)
+{
+    int k;
+    float square = 0.0f, length;
+    for (k = 0; k < width; k++) square += x[k] * x[k];
+    length = sqrtf(square + 1e-18f);
+    for (k = 0; k < width; k++) action[k] = x[k] * (tanhf(length) / length);
 }
 
 static int choose(const float *x)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,7 +27,7 @@ NORM_EPSILON = 1e-5  # layer normalisation adds this to the variance, as torch d
 class Layer:
     """One step of a program: rows x to rows y.
 
-    In C (in the macros of `templates/policy.c.jinja`) w0, w1, ... stand for the arrays. `torch` makes y [rows, width]
+    In C (in the names of `templates/policy.c.jinja`) w0, w1, ... stand for the arrays. `torch` makes y [rows, width]
     of x, the arrays, and the observations [rows, D]; the kind `gru` takes the hidden state [rows, H] instead of the
     latter, `sets` the tables.
     """
@@ -66,7 +66,7 @@ def norm(weight: Floats, bias: Floats) -> Layer:
     )
 
 
-def activation(kind: Literal["relu", "tanh"], width: int) -> Layer:
+def activation(kind: str, width: int) -> Layer:
     """Return relu or tanh of every number of a row."""
     return Layer(
         kind,
@@ -92,42 +92,33 @@ def gru(weight: Floats, bias: Floats, hidden_weight: Floats, hidden_bias: Floats
 
     return Layer(
         "gru",
-        c=f"""
-            affine(w0, w1, {len(weight)}, 3 * {size}, x, into);
-            affine(w2, w3, {size}, 3 * {size}, memory, back);
-            recur({size}, into, back, memory);
-            memcpy(x, memory, sizeof(float) * {size});""",
+        c=f"affine(w0, w1, {len(weight)}, 3 * {size}, x, into);\n"
+        f"affine(w2, w3, {size}, 3 * {size}, memory, back);\n"
+        f"recur({size}, into, back, memory);\n"
+        f"memcpy(x, memory, sizeof(float) * {size});",
         torch=advance,
         arrays=(weight, bias, hidden_weight, hidden_bias),
     )
 
 
-def cut(begin: int, end: int) -> Layer:
-    """Return columns `begin` to `end` of a row."""
-    return Layer(
-        "slice",
-        c=f"EACH memmove(X, X + {begin}, sizeof(float) * ({end} - {begin}));",
-        torch=lambda x, *_: x[:, begin:end],
-        numbers=(("begin", begin), ("end", end)),
-    )
-
-
-def convolution(weight: Floats, bias: Floats, shape: tuple[int, int, int], side: int, stride: int) -> Layer:
-    """Return a filter at every `stride`-th place of pictures of a shape (channels, rows, columns)."""
-    (channels, rows, columns), outputs = shape, bias.size
-    _, high, wide = convolved(shape, outputs, side, stride)
+def convolution(weight: Floats, bias: Floats, begin: int, shape: tuple[int, ...], side: int, stride: int) -> Layer:
+    """Return a filter at every `stride`-th place of pictures [channels, rows, columns] from column `begin` on."""
+    (channels, rows, columns), outputs, end = shape, bias.size, begin + math.prod(shape)
     filters = (outputs, channels, side, side)
+    said = {"begin": begin, "channels": channels, "rows": rows, "columns": columns, "side": side, "stride": stride}
     return Layer(
         "convolution",
-        c=f"EACH convolve(w0, w1, {channels}, {rows}, {columns}, {side}, {stride}, {outputs}, X, Y);\nSWAP;",
-        torch=lambda x, w, _: F.conv2d(x.unflatten(1, shape), w[0].T.reshape(filters), w[1], stride).flatten(1),
+        c=f"EACH convolve(w0, w1, {channels}, {rows}, {columns}, {side}, {stride}, {outputs}, X + {begin}, Y);\nSWAP;",
+        torch=lambda x, w, _: F.conv2d(
+            x[:, begin:end].unflatten(1, shape), w[0].T.reshape(filters), w[1], stride
+        ).flatten(1),
         arrays=(weight, bias),
-        numbers=(("channels", channels), ("rows", rows), ("columns", columns), ("side", side), ("stride", stride)),
-        width=outputs * high * wide,
+        numbers=(*said.items(),),
+        width=math.prod(convolved(shape, outputs, side, stride)),
     )
 
 
-def convolved(shape: tuple[int, int, int], outputs: int, side: int, stride: int) -> tuple[int, int, int]:
+def convolved(shape: tuple[int, ...], outputs: int, side: int, stride: int) -> tuple[int, int, int]:
     """Return channels, rows and columns that a convolution makes of a picture."""
     return outputs, (shape[1] - side) // stride + 1, (shape[2] - side) // stride + 1
 
@@ -148,25 +139,19 @@ def aggregate(begin: int, team: int, width: int, reach_squared: float) -> Layer:
     The observation holds others' relative positions from column `begin` on, two numbers each, in team order. Neighbours
     have a squared distance below `reach_squared`. Means divide by their number plus one, for the agent itself.
     """
-    others, reach, index = team - 1, math.sqrt(reach_squared), others_of(team)
+    index = torch.tensor(others_of(team))
 
-    def hear(x: Tensor, _: Any, observation: Tensor) -> Tensor:
-        ways = observation[:, begin : begin + 2 * others].unflatten(1, (others, 2))
+    def hear(x: Tensor, _: list[Tensor], observation: Tensor) -> Tensor:
+        ways = observation[:, begin : begin + 2 * (team - 1)].unflatten(1, (-1, 2))
         near = (ways.square().sum(2, keepdim=True) < reach_squared).float()
         share = near / (1 + near.sum(1, keepdim=True))  # [rows, N - 1, 1]
         own = torch.arange(x.shape[0])  # rows and not worlds: an archive with a number of worlds takes no single one
-        messages = x[(own - own % team).unsqueeze(1) + torch.tensor(index)[own % team]]
-        return torch.cat([x, (share * (ways / reach)).sum(1), (share * messages).sum(1)], 1)
+        messages = x[(own - own % team).unsqueeze(1) + index[own % team]]
+        return torch.cat([x, (share * (ways / math.sqrt(reach_squared))).sum(1), (share * messages).sum(1)], 1)
 
     return Layer(
         "aggregate",
-        c=f"aggregate(observation + {begin}, {width}, {literal(reach_squared)}, {literal(reach)}, x, y);\nSWAP;",
+        c=f"aggregate(observation + {begin}, {width}, {reach_squared}f, x, y);\nSWAP;",
         torch=hear,
         numbers=(("begin", begin), ("team", team), ("width", width), ("reach_squared", reach_squared)),
     )
-
-
-def literal(value: float) -> str:
-    """Return a float32 in C in full: nine digits tell every one apart."""
-    text = f"{value:.9g}"
-    return f"{text}f" if "." in text or "e" in text else f"{text}.0f"

@@ -5,14 +5,13 @@ from __future__ import annotations
 import base64
 import inspect
 import json
+import runpy
 import textwrap
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
 
 from esp_cli.export import numpy_policy
-from esp_cli.export.check import Numbers, Runner
-from esp_cli.export.layers import Floats
+from esp_cli.export.check import Numbers, Runner, Sample
 from esp_cli.export.program import Program
 from esp_cli.export.templates import filled
 
@@ -31,22 +30,10 @@ def numpy_source(program: Program, comment: str, description: dict[str, Any]) ->
 
 def numpy_runner(file: Path) -> Runner:
     """Run a written Python file."""
-    spec = spec_from_file_location(f"esp_exported_{id(file)}", file)
-    assert spec is not None
-    assert spec.loader is not None
-    module = module_from_spec(spec)
-    spec.loader.exec_module(module)
-    policy = module.POLICY
+    policy = runpy.run_path(str(file))["POLICY"]
 
-    def run(
-        obs: Floats, memory: Floats, mask: Numbers | None = None, sets: dict[str, Floats] | None = None
-    ) -> tuple[Numbers, Numbers, Numbers]:
-        count, team = len(obs), policy.program["team"]
-        lead = (count // team, team) if team > 1 else (count,)
-        inputs = [rows.reshape(*lead, rows.shape[1]) for rows in (obs, memory)]
-        allowed = None if mask is None else mask.reshape(*lead, mask.shape[1])
-        results = (*policy.step(*inputs, allowed, sets), policy.outputs(*inputs, sets)[0])
-        action, after, outputs = (rows.reshape(count, *rows.shape[len(lead) :]) for rows in results)
-        return action, outputs, after
+    def run(sample: Sample) -> tuple[Numbers, Numbers, Numbers]:
+        action, after = policy.step(sample.obs, sample.memory, sample.mask, sample.sets)
+        return action, policy.outputs(sample.obs, sample.memory, sample.sets)[0], after
 
     return run

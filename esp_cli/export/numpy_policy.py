@@ -59,17 +59,16 @@ class NumpyPolicy:
         x, memory = np.asarray(obs, np.float32), np.asarray(memory, np.float32)
         if x.shape[-1:] != (self.program["num_inputs"],):
             raise ValueError(f"the observation has shape {x.shape}, but (..., {self.program['num_inputs']}) is needed")
-        if self.program["team"] > 1 and x.shape[-2:-1] != (self.program["team"],):
-            raise ValueError(f"the observation has shape {x.shape}, but (..., {self.program['team']}, D) is needed")
+        if (team := self.program["team"]) > 1 and (x.ndim < 2 or x.shape[-2] % team):
+            raise ValueError(f"the observation has shape {x.shape}, but (..., {team}, D) is needed")
         if memory.shape != (*x.shape[:-1], self.hidden + self.previous):
             raise ValueError(f"the memory has shape {memory.shape}, but initial_memory{x.shape[:-1]} is needed")
         sets = self._tables(sets or {}, x.shape[:-1])
         hidden = memory[..., : self.hidden]
         obs, x = x, np.concatenate([x, memory[..., self.hidden :]], -1)
         for layer, arrays in self.layers:
-            remembers = layer["kind"] == "gru"
             x = LAYERS[layer["kind"]](x, layer, arrays, {"gru": hidden, "sets": sets}.get(layer["kind"], obs))
-            hidden = x if remembers else hidden
+            hidden = x if layer["kind"] == "gru" else hidden
         return x, hidden
 
     def _tables(self, sets: Any, lead: tuple[int, ...]) -> Any:
@@ -123,7 +122,8 @@ def _normalise(x: Any, _: dict[str, Any], arrays: list[Any], __: Any) -> Any:
 def _convolve(x: Any, layer: dict[str, Any], arrays: list[Any], _: Any) -> Any:
     """Apply filters to rows that hold pictures, channels first."""
     side, stride = layer["side"], layer["stride"]
-    pictures = x.reshape(*x.shape[:-1], layer["channels"], layer["rows"], layer["columns"])
+    shape = [layer["channels"], layer["rows"], layer["columns"]]
+    pictures = x[..., layer["begin"] : layer["begin"] + int(np.prod(shape))].reshape(*x.shape[:-1], *shape)
     windows = np.lib.stride_tricks.sliding_window_view(pictures, (side, side), (-2, -1))[..., ::stride, ::stride, :, :]
     places = windows.shape[-4] * windows.shape[-3]
     patches = np.moveaxis(windows, -5, -3).reshape(*x.shape[:-1], places, len(arrays[0]))
@@ -137,8 +137,8 @@ def _aggregate(x: Any, layer: dict[str, Any], _: list[Any], obs: Any) -> Any:
     near = ((ways * ways).sum(-1, keepdims=True) < reach_squared).astype(np.float32)
     share = near / (1 + near.sum(-2, keepdims=True))  # [..., N, N - 1, 1]
     others = [[j for j in range(team) if j != i] for i in range(team)]
-    messages = (share * x[..., others, :]).sum(-2)
-    return np.concatenate([x, (share * (ways / np.sqrt(reach_squared))).sum(-2), messages], -1)
+    heard = x.reshape(-1, team, x.shape[-1])[:, others].reshape(*ways.shape[:-1], x.shape[-1])
+    return np.concatenate([x, (share * (ways / np.sqrt(reach_squared))).sum(-2), (share * heard).sum(-2)], -1)
 
 
 def _pool_sets(x: Any, layer: dict[str, Any], arrays: list[Any], tables: Any) -> Any:
@@ -179,10 +179,9 @@ LAYERS = {
     "tanh": lambda x, *_: np.tanh(x),
     "norm": _normalise,
     "gru": _recur,
-    "slice": lambda x, layer, *_: x[..., layer["begin"] : layer["end"]],
     "convolution": _convolve,
     "global_max_pool": lambda x, layer, *_: x.reshape(*x.shape[:-1], layer["channels"], layer["places"]).max(-1),
     "aggregate": _aggregate,
     "sets": _pool_sets,
 }
-"""What a layer makes of rows x [..., width], with its arrays and the observations (a gru: its hidden state)."""
+"""What a layer makes of rows x [..., width], with its arrays and the observations, or hidden state, or tables."""

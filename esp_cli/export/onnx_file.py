@@ -12,8 +12,7 @@ from typing import Any
 import torch
 
 from esp_cli.defaults import __version__
-from esp_cli.export.check import Numbers, Runner
-from esp_cli.export.layers import Floats
+from esp_cli.export.check import Numbers, Runner, Sample
 from esp_cli.export.program import Program
 from esp_cli.export.sets import named
 from esp_cli.export.torch_file import exported_program
@@ -44,7 +43,7 @@ def onnx_model(program: Program, description: str) -> bytes:
     onnx, _ = library("onnx"), library("onnxscript")
     remembers = program.memory_width > 0
     inputs = ["observation", *["memory"] * remembers, *["action_mask"] * program.masked]
-    inputs += [f"set_{name}" for name in named([name for name, _ in program.sets])]
+    inputs += [f"set_{name}" for name in named(name for name, _ in program.sets).values()]
     outputs = ["action", "outputs", *["memory_out"] * remembers]
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # else it tells what no policy uses
     with warnings.catch_warnings():
@@ -73,14 +72,10 @@ def onnx_runner(file: Path) -> Runner:
     session = library("onnxruntime").InferenceSession(str(file), providers=["CPUExecutionProvider"])
     names = [value.name for value in session.get_inputs()]
 
-    def run(
-        obs: Floats, memory: Floats, mask: Numbers | None = None, sets: dict[str, Floats] | None = None
-    ) -> tuple[Numbers, Numbers, Numbers]:
-        rows = {"observation": obs, "memory": memory, "action_mask": mask}
-        rows |= {
-            f"set_{name}": table for name, table in zip(named([*(sets or {})]), (sets or {}).values(), strict=True)
-        }
+    def run(sample: Sample) -> tuple[Numbers, Numbers, Numbers]:
+        rows = {"observation": sample.obs, "memory": sample.memory, "action_mask": sample.mask}
+        rows |= {f"set_{name}": sample.sets[given] for given, name in named(sample.sets).items()}
         results = session.run(None, {name: rows[name] for name in names})
-        return results[0], results[1], results[2] if len(results) > 2 else memory
+        return results[0], results[1], results[2] if len(results) > 2 else sample.memory
 
     return run

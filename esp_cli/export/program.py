@@ -8,12 +8,13 @@ A program maps a row of observation, and of memory where it has one, to outputs,
     action = u tanh|u| / |u|               head `squash`, for each group u of x: a planar vector, or a single number
 
 The memory is [hidden state of the unit, previous action], the latter one-hot where it is a choice. Of a team, whose
-agents exchange messages, the rows of a world's agents are adjacent. Of a network over
-sets the observation is the own numbers, and each set comes as a table of its things, as many as there are.
+agents exchange messages, the rows of a world's agents are adjacent. Of a network over sets the observation is the own
+numbers, and each set comes as a table of its things, as many as there are.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, cast
 
@@ -28,14 +29,12 @@ from esp_cli.networks.contract import Network
 from esp_cli.networks.exploration import BoundedPoint, EpsilonGreedy, ExploringCategorical
 from esp_cli.networks.heads import BoundedGaussian, Categorical
 from esp_cli.networks.layers import SeedLayerNorm, SeedLinear, SeedMLP
-from esp_cli.networks.message_passing import REACH_SQUARED, MessagePassing, PictureEncoder
+from esp_cli.networks.message_passing import REACH_SQUARED, MessagePassing
 from esp_cli.networks.plain import GRU, MLP
 from esp_cli.networks.policy import HistoryPolicy, Policy
 from esp_cli.networks.sets import RecurrentSetNetwork, SetNetwork
 from esp_cli.networks.symmetrised import Separate
 from esp_envs.errors import UserError
-
-SQUASH_EPSILON = 1e-18  # squashing adds this to the squared length (`esp_cli.networks.heads.squash`)
 
 
 @dataclass(frozen=True)
@@ -48,12 +47,12 @@ class Program:
     hidden: int  # H, numbers of the hidden state; 0 for a policy that remembers nothing
     previous: int  # numbers of the previous action in the memory
     head: Literal["choose", "squash"]  # how the outputs become an action
-    groups: tuple[int, ...]  # widths of what is squashed together; empty where the head chooses
+    groups: Sequence[int]  # widths of what is squashed together; empty where the head chooses
     team: int = 1  # agents that act together, with their rows side by side; 1 where each acts by itself
     masked: bool = False  # whether a mask of allowed actions [A] comes along; one that allows none allows all
     # of a network over sets: where a task's observation has the own numbers, and each set's things with their numbers
-    own: tuple[int, ...] = ()
-    sets: tuple[tuple[str, tuple[tuple[int, ...], ...]], ...] = ()
+    own: Sequence[int] = ()
+    sets: Sequence[tuple[str, Sequence[Sequence[int]]]] = ()
 
     @property
     def memory_width(self) -> int:
@@ -87,20 +86,19 @@ def program_of(policy: Policy, masked: bool = False) -> Program:
         actor, sums = actor.network, [layers.affine(parts, np.zeros(parts.shape[1], np.float32))]
     previous = policy.head.num_outputs if isinstance(policy, HistoryPolicy) and policy.recurrent else 0
     own, sets = _sets(actor, previous) if isinstance(actor, SetNetwork | RecurrentSetNetwork) else (_network(actor), {})
-    if isinstance(head, Categorical | ExploringCategorical | EpsilonGreedy):
-        groups: tuple[int, ...] = ()
-    elif isinstance(head, BoundedGaussian | BoundedPoint):
-        groups = _groups(head.disc)
-    else:
+    groups: list[int] = []
+    if isinstance(head, BoundedGaussian | BoundedPoint):  # blocks of ones, in which a row's first one is the first row
+        groups = head.disc.argmax(1).unique(return_counts=True)[1].tolist()
+    elif not isinstance(head, Categorical | ExploringCategorical | EpsilonGreedy):
         raise UserError(f"a head of the kind {type(head).__name__} cannot be exported")
     if isinstance(actor, MessagePassing):
-        inputs = max(actor.picture.stop, actor.others.stop)
+        read = max(actor.picture.stop, actor.others.stop)
     elif sets:
-        inputs = len(sets["own"]) + previous
+        read = len(sets["own"])
     else:
-        inputs = next(len(layer.arrays[0]) for layer in own if layer.kind == "affine")
+        read = next(len(layer.arrays[0]) for layer in own if layer.kind == "affine") - previous
     return Program(
-        num_inputs=inputs - previous,
+        num_inputs=read,
         layers=(*own, *sums),
         num_outputs=head.num_outputs,
         hidden=actor.memory_width,
@@ -114,15 +112,12 @@ def program_of(policy: Policy, masked: bool = False) -> Program:
 
 
 def _network(actor: Network) -> list[Layer]:
-    if isinstance(actor, MLP):
+    if isinstance(actor, MLP | Equivariant):
         return _perceptron(actor)
     if isinstance(actor, GRU):
         norm = [_norm(actor.norm)] if isinstance(actor.norm, SeedLayerNorm) else []
         unit = layers.gru(*_arrays(actor.gru.input), *_arrays(actor.gru.recurrent))
         return [*_perceptron(actor.body), unit, *norm, _affine(actor.head)]
-    if isinstance(actor, Equivariant):
-        *hidden, last = actor.layers
-        return [*(part for layer in hidden for part in _activated(layer, actor.activation)), _affine(last)]
     if isinstance(actor, MessagePassing):
         return _message_passing(actor)
     raise UserError(
@@ -147,56 +142,39 @@ def _sets(actor: SetNetwork | RecurrentSetNetwork, previous: int) -> tuple[list[
     ):
         (first, bias), second = map(_arrays, cast("nn.ModuleList", embed.layers))
         width = len(first) - encoder.num_own
-        things = tuple(
-            tuple(
-                part.where.start + k * part.field.item_width + i
-                for part in family.parts
-                for i in range(part.field.item_width)
-            )
-            for k in range(family.count)
-        )
+        things = [np.arange(part.where.start, part.where.stop).reshape(family.count, -1) for part in family.parts]
         at = None if reader is None else columns.index(reader)
-        sets.append(SetOf(family.name, things, place, at, (first[:width], first[width:], bias, *second)))
+        arrays = (first[:width], first[width:], bias, *second)
+        sets.append(SetOf(family.name, np.hstack(things).tolist(), place, at, arrays))
     features = pool_sets(sets, own, kept, len(columns), previous, rows.near, actor.activation)
-    found = {"own": tuple(columns), "sets": tuple((each.name, each.columns) for each in sets)}
+    found = {"own": columns, "sets": [(each.name, each.columns) for each in sets]}
     return [features, *(_perceptron(actor.head) if isinstance(actor, SetNetwork) else _network(actor.unit))], found
 
 
 def _message_passing(actor: MessagePassing) -> list[Layer]:
-    own = [layers.cut(actor.picture.start, actor.picture.stop), *_pictures(actor.encoder)]
+    encoder, own = actor.encoder, list[Layer]()
+    begin, shape = actor.picture.start, encoder.shape
+    for layer, side, stride in zip(encoder.layers, encoder.sides, encoder.strides, strict=True):
+        filters = layers.convolution(*_arrays(layer), begin, shape, side, stride)
+        own += [filters, layers.activation("relu", filters.width)]
+        begin, shape = 0, layers.convolved(shape, filters.arrays[1].size, side, stride)
+    own.append(layers.global_max_pool(shape[0], shape[1] * shape[2]))
     for layer in actor.layers:
-        inputs = len(_arrays(layer)[0])
-        own.append(layers.aggregate(actor.others.start, actor.team, (inputs - 2) // 2, REACH_SQUARED))
-        own += _activated(layer, "relu")
+        linear = _affine(layer)
+        inputs, outputs = linear.arrays[0].shape
+        hear = layers.aggregate(actor.others.start, actor.team, (inputs - 2) // 2, REACH_SQUARED)
+        own += [hear, linear, layers.activation("relu", outputs)]
     return [*own, _affine(actor.head)]
 
 
-def _pictures(encoder: PictureEncoder) -> list[Layer]:
-    own: list[Layer] = []
-    shape = encoder.shape
-    for layer, side, stride in zip(encoder.layers, encoder.sides, encoder.strides, strict=True):
-        filters = layers.convolution(*_arrays(layer), shape, side, stride)
-        own += [filters, layers.activation("relu", filters.width)]
-        shape = layers.convolved(shape, filters.arrays[1].size, side, stride)
-    channels, rows, columns = shape
-    return [*own, layers.global_max_pool(channels, rows * columns)]
-
-
-def _perceptron(mlp: SeedMLP) -> list[Layer]:
-    norms = [] if mlp.norms is None else [_norm(norm) for norm in mlp.norms]
-    own: list[Layer] = [*norms[:1]]
-    last = len(mlp.layers) - 1
+def _perceptron(mlp: SeedMLP | Equivariant) -> list[Layer]:
+    norms = [_norm(norm) for norm in getattr(mlp, "norms", None) or ()]
+    own, last = norms[:1], len(mlp.layers) - 1
     for k, linear in enumerate(mlp.layers):
-        if k < last or mlp.activate_output:
-            own += [*_activated(linear, mlp.activation), *norms[k + 1 : k + 2]]
-        else:
-            own.append(_affine(linear))
+        own.append(_affine(linear))
+        if k < last or getattr(mlp, "activate_output", False):
+            own += [layers.activation(mlp.activation, own[-1].arrays[1].size), *norms[k + 1 : k + 2]]
     return own
-
-
-def _activated(linear: object, name: str) -> list[Layer]:
-    weight, bias = _arrays(linear)
-    return [layers.affine(weight, bias), layers.activation("relu" if name == "relu" else "tanh", bias.size)]
 
 
 def _affine(linear: object) -> Layer:
@@ -218,9 +196,3 @@ def _norm(norm: object) -> Layer:
 
 def _plain(tensor: Tensor) -> Floats:
     return tensor.detach().cpu().float().numpy().copy()
-
-
-def _groups(disc: Tensor) -> tuple[int, ...]:
-    """Return the widths of the blocks of a block-diagonal matrix of ones."""
-    starts = disc.argmax(1).unique(return_counts=True)  # a row's first one is where its block begins
-    return tuple(starts[1].tolist())

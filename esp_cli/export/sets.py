@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from esp_cli.export.layers import Floats, Layer
+from esp_cli.export.templates import filled
 from esp_cli.networks.set_features import distances_among, nearest_things
 
 
@@ -17,7 +18,7 @@ class SetOf:
     """One set of things, and the weights that embed each of them."""
 
     name: str
-    columns: tuple[tuple[int, ...], ...]  # of an observation, for each thing those of its numbers [K, W]
+    columns: Sequence[Sequence[int]]  # of an observation, for each thing those of its numbers [K, W]
     place: int | None  # the number at which a thing's place begins; None where it has none
     reader: int | None  # the own number at which the reader's place begins; None where it is the origin
     arrays: tuple[Floats, ...]  # W_1 [W + distances, H] of a thing, V [own, H] of the own numbers, b_1, W_2, b_2
@@ -28,9 +29,9 @@ class SetOf:
         return len(self.columns[0])
 
 
-def named(sets: Sequence[str]) -> list[str]:
+def named(sets: Iterable[str]) -> dict[str, str]:
     """Return the names of sets in C and ONNX."""
-    return [name if name.isidentifier() and name.isascii() else str(k) for k, name in enumerate(sets)]
+    return {name: name if name.isidentifier() and name.isascii() else str(k) for k, name in enumerate(sets)}
 
 
 def pool_sets(
@@ -44,6 +45,7 @@ def pool_sets(
     """
     features, num_own = len(sets[0].arrays[-1]), own[1].size if own else len(kept)
     outputs = num_own + 2 * features * len(sets) + beside
+    said = {"kept": list(kept), "inputs": inputs, "near": near, "embeds_own": bool(own)}
     structure = [(each.name, each.place, each.reader) for each in sets]
 
     def pooled(x: Tensor, w: list[Tensor], tables: Mapping[str, Tensor]) -> Tensor:
@@ -70,75 +72,16 @@ def pool_sets(
 
     return Layer(
         "sets",
-        c=_c(sets, bool(own), kept, inputs, beside, near, kind),
+        c=filled(
+            "sets.c", sets=sets, names=named([each.name for each in sets]), **said, beside=beside, kind=kind
+        ).decode(),
         torch=pooled,
         arrays=(*own, *(array for each in sets for array in each.arrays)),
-        numbers=(
-            ("sets", structure),
-            ("kept", list(kept)),
-            ("inputs", inputs),
-            ("near", near),
-            ("activation", kind),
-            ("embeds_own", bool(own)),
-        ),
+        numbers=(("sets", structure), *said.items(), ("activation", kind)),
         width=max(inputs + beside, outputs),
     )
 
 
 def _each(things: Tensor, weight: Tensor) -> Tensor:
-    """Return things [rows, K, W] times a weight, in a form that an archive takes for any K."""
+    """Return things [rows, K, W] times a weight, in a form that ONNX takes for any K."""
     return torch.bmm(things, weight.expand(things.shape[0], -1, -1))
-
-
-def _c(
-    sets: Sequence[SetOf], embeds_own: bool, kept: Sequence[int], inputs: int, beside: int, near: int, kind: str
-) -> str:
-    """Return the C of a row, in which `set_NAME` has `num_NAME` things: each is described, embedded and pooled."""
-    features, (num_own, _) = sets[0].arrays[3].shape[0], sets[0].arrays[1].shape
-    located = [(k, each) for k, each in enumerate(sets) if each.place is not None]
-    nearest = located if near else []
-    lines = [
-        "static const float origin[2] = {0.0f, 0.0f};",
-        f"static float own[{len(kept)}], thing[{max(len(each.arrays[0]) for each in sets)}];",
-        f"static float shared[{features}], first[{features}], second[{features}];",
-        *(f"static float near{k}[{near * each.width}];" for k, each in nearest),
-        "float none = 0.0f;",
-    ]
-    for k, name in enumerate(named([each.name for each in sets])):
-        lines += [f"const float *things{k} = set_{name};", f"int count{k} = num_{name};"]
-    for k, each in nearest:
-        reader = "origin" if each.reader is None else f"x + {each.reader}"
-        chosen = f"nearest_things(things{k}, count{k}, {each.width}, {each.place}, {reader}, {near}, near{k})"
-        lines += [f"count{k} = {chosen};", f"things{k} = near{k};"]
-    for k, each in located:
-        lines.append(f"none = farthest(things{k} + {each.place}, count{k}, {each.width}, origin, none);")
-    lines += [f"own[{k}] = x[{column}];" for k, column in enumerate(kept)]
-    if embeds_own:
-        lines += [f"affine(w0, w1, {len(kept)}, {num_own}, own, y);", f"apply_{kind}(y, {num_own});"]
-    else:
-        lines.append("memcpy(y, own, sizeof(own));")
-    array, column = 2 * embeds_own, num_own
-    for k, each in enumerate(sets):
-        w = [f"w{array + i}" for i in range(5)]
-        far = []
-        if each.place is not None:
-            far.append(f"thing[{each.width}] = sqrtf(apart(at + {each.place}, origin));")
-            for column_of, (j, other) in enumerate(located, each.width + 1):
-                given = f"at + {each.place}, things{j} + {other.place}, count{j}, {other.width}, 4.0f * none"
-                far.append(f"thing[{column_of}] = sqrtf(nearest({given}));")
-        lines += [
-            f"affine({w[1]}, {w[2]}, {num_own}, {features}, y, shared);",
-            f"for (i = 0; i < count{k}; i++) {{",
-            f"const float *at = things{k} + i * {each.width};",
-            f"memcpy(thing, at, sizeof(float) * {each.width});",
-            *far,
-            f"affine({w[0]}, shared, {len(each.arrays[0])}, {features}, thing, first);",
-            f"apply_{kind}(first, {features});",
-            f"affine({w[3]}, {w[4]}, {features}, {features}, first, second);",
-            f"apply_{kind}(second, {features});",
-            f"pool({features}, i, count{k}, second, y + {column});",
-            "}",
-        ]
-        array, column = array + 5, column + 2 * features
-    lines += [f"memcpy(y + {column}, x + {inputs}, sizeof(float) * {beside});"] if beside else []
-    return "\n".join(["{", *lines, "}", "SWAP;"])

@@ -9,10 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from esp_cli.export.check import Numbers, Runner
-from esp_cli.export.layers import Floats
-from esp_cli.export.program import SQUASH_EPSILON, Program
-from esp_cli.networks.heads import masked
+from esp_cli.export.check import Numbers, Runner, Sample
+from esp_cli.export.program import Program
+from esp_cli.networks.heads import masked, squash
 
 
 class TorchProgram(nn.Module):
@@ -29,6 +28,7 @@ class TorchProgram(nn.Module):
         for k, layer in enumerate(program.layers):
             for i, array in enumerate(layer.arrays):
                 self.register_buffer(f"w{k}_{i}", torch.from_numpy(array.copy()))
+        self.disc = torch.block_diag(*(torch.ones(width, width) for width in program.groups or (1,)))
 
     def forward(
         self,
@@ -49,17 +49,10 @@ class TorchProgram(nn.Module):
             action = masked(x, action_mask).argmax(-1)
             encoded = nn.functional.one_hot(action, program.num_outputs).float()
         else:
-            action = encoded = _squash(x, program.groups)
+            action = encoded = squash(x, self.disc)
         if memory is None:
             return action, x
         return action, x, torch.cat([hidden, encoded], 1) if program.previous else hidden
-
-
-def _squash(x: Tensor, groups: tuple[int, ...]) -> Tensor:
-    """Bring each group of numbers into its bounds: u tanh|u| / |u|."""
-    parts = x.split(list(groups), -1)
-    lengths = [(part.square().sum(-1, keepdim=True) + SQUASH_EPSILON).sqrt() for part in parts]
-    return torch.cat([part * (torch.tanh(length) / length) for part, length in zip(parts, lengths, strict=True)], -1)
 
 
 def exported_program(program: Program) -> torch.export.ExportedProgram:
@@ -69,7 +62,7 @@ def exported_program(program: Program) -> torch.export.ExportedProgram:
     inputs = {"observation": torch.zeros(2 * program.team, program.num_inputs)}
     if program.memory_width:
         inputs["memory"] = torch.zeros(2 * program.team, program.memory_width)
-    arguments, named = tuple(inputs.values()), dict[str, Any]()
+    named = dict[str, Any]()
     if program.masked:
         named["action_mask"] = torch.ones(2 * program.team, program.num_outputs, dtype=torch.bool)
     shapes: dict[str, Any] = {name: {0: rows} for name in inputs | named}
@@ -77,7 +70,7 @@ def exported_program(program: Program) -> torch.export.ExportedProgram:
         widths = {name: len(columns[0]) for name, columns in program.sets}
         named["sets"] = {name: torch.zeros(2, 3 + k, width) for k, (name, width) in enumerate(widths.items())}
         shapes["sets"] = {name: {0: rows, 1: torch.export.Dim(f"things{k}")} for k, name in enumerate(widths)}
-    return torch.export.export(TorchProgram(program).eval(), arguments, named, dynamic_shapes=shapes)
+    return torch.export.export(TorchProgram(program).eval(), (*inputs.values(),), named, dynamic_shapes=shapes)
 
 
 def torch_archive(program: Program, description: str) -> bytes:
@@ -91,15 +84,13 @@ def torch_runner(file: Path) -> Runner:
     """Run a written torch.export archive."""
     module = torch.export.load(file).module()
 
-    def run(
-        obs: Floats, memory: Floats, mask: Numbers | None = None, sets: dict[str, Floats] | None = None
-    ) -> tuple[Numbers, Numbers, Numbers]:
-        allowed: dict[str, Any] = {} if mask is None else {"action_mask": torch.from_numpy(mask)}
-        if sets:
-            allowed["sets"] = {name: torch.from_numpy(table) for name, table in sets.items()}
-        inputs = [torch.from_numpy(array) for array in (obs, memory) if array.shape[1]]
-        with torch.no_grad():
-            results = [result.numpy() for result in module(*inputs, **allowed)]
-        return results[0], results[1], results[2] if len(results) > 2 else memory
+    @torch.no_grad()
+    def run(sample: Sample) -> tuple[Numbers, Numbers, Numbers]:
+        rows = [torch.from_numpy(array) for array in (sample.obs, sample.memory) if array.shape[1]]
+        named: dict[str, Any] = {} if sample.mask is None else {"action_mask": torch.from_numpy(sample.mask)}
+        if sample.sets:
+            named["sets"] = {name: torch.from_numpy(table) for name, table in sample.sets.items()}
+        results = [result.numpy() for result in module(*rows, **named)]
+        return results[0], results[1], results[2] if len(results) > 2 else sample.memory
 
     return run

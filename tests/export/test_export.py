@@ -60,9 +60,9 @@ def test_a_wrong_weight_is_found(kind: str) -> None:
         weights[5] += spoilt
         policy = NumpyPolicy(json.loads(json.dumps(program.describe())), weights.tobytes())
 
-        def run(obs, memory, mask=None):
-            action, after = policy.step(obs, memory)
-            return action, policy.outputs(obs, memory)[0], after
+        def run(sample):
+            action, after = policy.step(sample.obs, sample.memory)
+            return action, policy.outputs(sample.obs, sample.memory)[0], after
 
         return run
 
@@ -76,7 +76,7 @@ def test_another_choice_that_is_no_tie_is_found() -> None:
     sample = take_sample(trained, program_of(trained.policy), 100)
     others = (sample.action + 1) % 5
     with pytest.raises(RuntimeError, match="differs from the policy"):
-        compare(sample, lambda obs, memory, mask: (others, sample.outputs, sample.after))
+        compare(sample, lambda sample: (others, sample.outputs, sample.after))
 
 
 @pytest.mark.parametrize(("kind", "spoilt"), [("choice, recurrent", "memory"), ("wheels", "action")])
@@ -86,7 +86,7 @@ def test_another_memory_or_another_bounded_action_is_found(kind: str, spoilt: st
     right, wrong = {"action": sample.action, "memory": sample.after}, 0.01
 
     def runner(said: dict[str, np.ndarray]) -> check.Runner:
-        return lambda obs, memory, mask: (said["action"], sample.outputs, said["memory"])
+        return lambda sample: (said["action"], sample.outputs, said["memory"])
 
     assert compare(sample, runner(right)).max_difference == 0
     with pytest.raises(RuntimeError, match=r"differs from the policy by 0\.01"):
@@ -99,7 +99,7 @@ def test_layers_of_a_small_policy_by_hand() -> None:
     assert (first.kind, last.kind) == ("affine", "affine")
     assert (first.arrays[0].shape, last.arrays[0].shape) == ((8, 3), (3, 2))
     assert program.num_parameters == 8 * 3 + 3 + 3 * 2 + 2 == 35
-    assert (program.head, program.groups, program.memory_width) == ("squash", (1, 1), 0)
+    assert (program.head, program.groups, program.memory_width) == ("squash", [1, 1], 0)
 
 
 def test_layers_of_a_recurrent_policy_with_its_previous_action() -> None:
@@ -109,7 +109,7 @@ def test_layers_of_a_recurrent_policy_with_its_previous_action() -> None:
     assert (program.hidden, program.previous, program.memory_width) == (4, 5, 9)
     assert program.num_inputs == 14
     assert program.head == "choose"
-    assert program_of(drawn_policy("vector").policy).groups == (2,)
+    assert program_of(drawn_policy("vector").policy).groups == [2]
 
 
 def test_the_python_file_runs_alone_and_checks_itself(tmp_path: Path) -> None:

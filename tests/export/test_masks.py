@@ -13,7 +13,7 @@ import torch
 
 from esp_cli.export import c_file, onnx_file
 from esp_cli.export.c_file import c_runner, c_source
-from esp_cli.export.check import compare, take_sample
+from esp_cli.export.check import Sample, compare, take_sample
 from esp_cli.export.export import export
 from esp_cli.export.numpy_policy import NumpyPolicy
 from esp_cli.export.onnx_file import onnx_model, onnx_runner
@@ -83,7 +83,7 @@ def test_an_export_that_ignores_masks_is_found() -> None:
     assert not sample.mask.all()
     free = sample.outputs.argmax(-1)
     with pytest.raises(RuntimeError, match="differs from the policy"):
-        compare(sample, lambda obs, memory, mask: (free, sample.outputs, sample.after))
+        compare(sample, lambda sample: (free, sample.outputs, sample.after))
 
 
 def test_a_mask_is_asked_for_and_has_a_shape() -> None:
@@ -109,10 +109,11 @@ def test_agents_that_exchange_messages_choose_among_allowed_actions(tmp_path: Pa
     for name, content in c_source(program, "").items():
         (tmp_path / name).write_bytes(content)
     (tmp_path / "policy.onnx").write_bytes(onnx_model(program, "{}"))
-    action, outputs, _ = c_runner(tmp_path / "policy.c", program)(rows, memory, mask)
+    sample = Sample(rows, memory, mask, {}, memory, memory, memory)
+    action, outputs, _ = c_runner(tmp_path / "policy.c", program)(sample)
     expected = np.where(mask | ~mask.any(-1, keepdims=True), outputs, -np.inf).argmax(-1)
     assert action.tolist() == expected.tolist()
     assert (action[0], action[1]) == (outputs[0].argmax(), 0)
-    assert onnx_runner(tmp_path / "policy.onnx")(rows, memory, mask)[0].tolist() == expected.tolist()
+    assert onnx_runner(tmp_path / "policy.onnx")(sample)[0].tolist() == expected.tolist()
     through_torch = TorchProgram(program)(torch.from_numpy(rows), action_mask=torch.from_numpy(mask))[0]
     assert through_torch.tolist() == expected.tolist()

@@ -8,7 +8,7 @@ import pytest
 
 from esp_cli.export import c_file
 from esp_cli.export.c_file import c_runner, c_source
-from esp_cli.export.check import Runner, compare, take_sample
+from esp_cli.export.check import Runner, Sample, compare, take_sample
 from esp_cli.export.numpy_file import numpy_runner, numpy_source
 from esp_cli.export.onnx_file import onnx_model, onnx_runner
 from esp_cli.export.program import Program, program_of
@@ -31,6 +31,11 @@ def runners(program: Program, folder: Path) -> dict[str, Runner]:
     return made
 
 
+def sample_of(own: np.ndarray, sets: dict[str, np.ndarray]) -> Sample:
+    none = own[:, :0]
+    return Sample(own, none, None, sets, none, none, none)
+
+
 @pytest.mark.parametrize(
     ("near", "expected"),
     # distances 5 and 1, with sqrt(18) between both; alone, to no other: twice its own distance
@@ -46,7 +51,19 @@ def test_features_of_things_by_hand(near: int, expected: list[float], tmp_path: 
     own, sets = program.split(np.array([[7, 3, 4, 0, 1], [7, 0, 1, 3, 4]], np.float32))
     assert sets["spots"].tolist() == [[[3, 4], [0, 1]], [[0, 1], [3, 4]]]
     for run in runners(program, tmp_path).values():
-        np.testing.assert_allclose(run(own, own[:, :0], None, sets)[1], [expected] * 2, rtol=1e-6)
+        np.testing.assert_allclose(run(sample_of(own, sets))[1], [expected] * 2, rtol=1e-6)
+
+
+@pytest.mark.skipif(c_file.compiler() is None, reason="needs a C compiler")
+def test_a_set_of_things_without_a_place_compiles(tmp_path: Path) -> None:
+    one, zero = np.ones((1, 1), np.float32), np.zeros(1, np.float32)
+    marks = SetOf("to read", ((1,), (2,)), place=None, reader=None, arrays=(one, 0 * one, zero, one, zero))
+    layer = pool_sets([marks], (), [0], inputs=1, beside=0, near=0, kind="relu")
+    program = Program(1, (layer,), 3, 0, 0, "choose", (), own=(0,), sets=(("to read", marks.columns),))
+    for name, source in c_source(program, "").items():
+        (tmp_path / name).write_bytes(source)
+    sample = sample_of(*program.split(np.array([[7, 2, 4]], np.float32)))
+    assert c_runner(tmp_path / "policy.c", program)(sample)[1].tolist() == [[7, 3, 4]]
 
 
 @pytest.mark.parametrize("near", [0, 2])
@@ -77,7 +94,7 @@ def test_the_python_file_refuses_tables_that_do_not_fit(tmp_path: Path) -> None:
         ({"landmarks": landmarks[:, :0], "others": np.zeros((2, 1, 2))}, "K > 0"),
     ):
         with pytest.raises(ValueError, match=sentence):
-            run(own, own[:, :0], None, sets)
+            run(sample_of(own, sets))
 
 
 def test_the_equivariant_network_over_sets_is_refused() -> None:
