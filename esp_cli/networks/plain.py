@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from esp_cli.networks.contract import VJP, ActivationName, Generators, IoSpec, Memoryless, Network, NetworkConfig
 from esp_cli.networks.kernels.library import WORTH_COMPILING, has_compiler
 from esp_cli.networks.layers import GAINS, SeedLayerNorm, SeedLinear, SeedMLP
-from esp_cli.networks.ordering import NearestFirst
 from esp_cli.networks.perceptron import Shape, perceptron
 from esp_cli.networks.recurrent import SeedGRU
 from esp_envs.errors import UserError
@@ -49,13 +48,6 @@ class PlainConfig(CompiledConfig):
     separate_parts: bool = Field(
         False, description="discrete wheel pairs: one output per speed of each wheel; a pair's output is their sum"
     )
-    order: Literal["given", "nearest"] = Field(
-        "given", description="of like things in an observation; nearest: each set sorted by distance, the nearest first"
-    )
-
-    def ordered(self, network: Network, io: IoSpec | None) -> Network:
-        """Return a network that reads rows in this order."""
-        return network if self.order == "given" else NearestFirst(network, self.io_or_refuse(io), self.products[1])
 
     @property
     def products(self) -> tuple[torch.dtype, bool]:
@@ -89,7 +81,7 @@ class MlpConfig(PlainConfig):
     def build(
         self, generators: Generators, inputs: int, outputs: int, output_gain: float, io: IoSpec | None
     ) -> Network:
-        return self.ordered(MLP(generators, inputs, outputs, self, output_gain), io)
+        return MLP(generators, inputs, outputs, self, output_gain)
 
 
 class GruConfig(PlainConfig):
@@ -102,7 +94,7 @@ class GruConfig(PlainConfig):
     def build(
         self, generators: Generators, inputs: int, outputs: int, output_gain: float, io: IoSpec | None
     ) -> Network:
-        return self.ordered(GRU(generators, inputs, outputs, self, output_gain), io)
+        return GRU(generators, inputs, outputs, self, output_gain)
 
 
 class MLP(SeedMLP, Memoryless):

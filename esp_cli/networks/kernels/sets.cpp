@@ -61,34 +61,6 @@ void distances(const int64_t *shape, const int64_t *sizes, const float *places, 
     });
 }
 
-// Sort the things of rows [rows, row] by the distance of their places, which begin at number `at` of a thing, from that
-// at column `reader`, or from the origin where it is negative. columns: [things, width], where a thing's numbers are.
-void sort(const int64_t *shape, const int64_t *columns, float *rows) {
-    const int64_t row = shape[1], things = shape[2], width = shape[3], at = shape[4], reader = shape[5];
-    each_rows(shape[0], shape[6], things * (width + 2), [&](Span span, float *own) {
-        float *moved = own + things;                // [things, width]
-        float *order = moved + things * width;      // small whole numbers
-        for (int64_t r = span.begin; r < span.end; r++) {
-            float *x = rows + r * row, here[] = {reader < 0 ? 0 : x[reader], reader < 0 ? 0 : x[reader + 1]};
-            for (int64_t k = 0; k < things; k++) {
-                float a = x[columns[k * width + at]] - here[0], b = x[columns[k * width + at + 1]] - here[1];
-                float square = a * a + b * b;
-                int64_t place = k;
-                for (; place > 0 && own[place - 1] > square; place--) {
-                    own[place] = own[place - 1];
-                    order[place] = order[place - 1];
-                }
-                own[place] = square;
-                order[place] = k;
-            }
-            for (int64_t k = 0; k < things * width; k++) moved[k] = x[columns[k]];
-            for (int64_t k = 0; k < things; k++)
-                for (int64_t c = 0; c < width; c++)
-                    x[columns[k * width + c]] = moved[static_cast<int64_t>(order[k]) * width + c];
-        }
-    });
-}
-
 // Pass the things of sets, [S, R K, in], through a perceptron that ends with an activation, and write mean and maximum
 // over each set, [S, R, 2 out], and what it gives of each thing, [S, R K, out], where there is room for it.
 void pool(const Perceptron *given, const Rows *pooled, const Rows *each) {

@@ -26,21 +26,6 @@ def compiled_distances(places: Sequence[Tensor]) -> list[Tensor]:
     return list(found.split(sizes, 2))
 
 
-def sort_things(rows: Tensor, columns: Tensor, at: int, reader: int | None) -> None:
-    """Sort the things of a set in contiguous rows [B, D] on the CPU, in place, by distance from the column `reader`.
-
-    Each thing's numbers are in `columns` [K, W], and its place begins with the number `at`. None stands for the origin.
-    """
-    own = -1 if reader is None else reader
-    call(
-        "sets",
-        "sort",
-        _shape(*rows.shape, *columns.shape, at, own, torch.get_num_threads()),
-        columns.contiguous(),
-        rows,
-    )
-
-
 class _PooledPass(CompiledPass):
     """A pass of things [S, B, K, .] whose outputs are mean and maximum over each set, [S, B, 2H].
 
