@@ -36,8 +36,6 @@ class SetEquivariantConfig(SetConfig):
         self, generators: Generators, inputs: int, outputs: int, output_gain: float, io: IoSpec | None
     ) -> Network:
         io = sets_or_refuse(self.name, self.io_or_refuse(io))
-        if self.memory:
-            raise UserError("set-equivariant remembers nothing; use set with network.memory")
         if io.num_values is not None:
             return SetNetwork(generators, io, outputs, self, output_gain)
         action = io.spaces.action
@@ -77,10 +75,8 @@ class InvariantRows(Rows):
     With A directions [S, B, .] become [S, B A, .], with each vector's component along one, and whether it is one.
     """
 
-    def __init__(
-        self, layout: Layout, shifts: bool, near: int, compiled: bool, points: Sequence[Sequence[float]] = ()
-    ) -> None:
-        super().__init__(layout, shifts, near, compiled)
+    def __init__(self, layout: Layout, shifts: bool, compiled: bool, points: Sequence[Sequence[float]] = ()) -> None:
+        super().__init__(layout, shifts, compiled)
         self.own_columns = _columns([part.field for part in layout.own if part.where in self.own])
         one = [[_one(part.field) for part in family.parts] for family in self.families]
         self.columns = [_columns(fields) for fields in one]
@@ -151,7 +147,7 @@ class DirectionActor(Memoryless):
         action = io.spaces.action
         assert isinstance(action, Discrete)
         compiled = config.compiled is True
-        rows = InvariantRows(io.layout, io.spaces.shifts, config.near, compiled, action.points)
+        rows = InvariantRows(io.layout, io.spaces.shifts, compiled, action.points)
         self.network = SetNetwork(generators, io, 1, config, output_gain, rows)
 
     def forward(self, x: Tensor) -> Tensor:
