@@ -126,7 +126,11 @@ class Categorical(Choice):
         """Return the policies that outputs [S, P B, T, N, A] are, for losses with slopes."""
         compiled = outputs.waits or computes(self.compiled, outputs.tensor)
         orders = frame.orders(self.num_outputs) if compiled else None
-        return CategoricalPolicies(outputs, frame) if orders is None else CompiledCategoricalPolicies(outputs, orders)
+        return (
+            CategoricalPolicies(outputs, frame)
+            if orders is None
+            else CompiledCategoricalPolicies(outputs, frame, orders)
+        )
 
 
 class BoundedGaussian(Head):

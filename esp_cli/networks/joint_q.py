@@ -5,18 +5,18 @@ Shape letters: S seeds, W agents' scenes (any axes), N agents, C values (1 or N)
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
-from torch.autograd import Function
 from torch.nn.functional import elu
 
 from esp_cli.networks.contract import Generators
 from esp_cli.networks.kernels.library import begin, computes
 from esp_cli.networks.kernels.mixer import CompiledMixer
 from esp_cli.networks.layers import SeedLinear, SeedMLP
-from esp_cli.networks.perceptron import CACHED_ROWS, affine
+from esp_cli.networks.perceptron import CACHED_ROWS, affine, passed
 from esp_envs.spec import Spaces
 
 
@@ -153,8 +153,8 @@ class MonotonicMixer(nn.Module):
         """Mix the agents' values [S, ..., N] by the state [S, ..., state width] to [S, ...]."""
         own = values.reshape(values.shape[0], -1, values.shape[-1])
         if computes(self.hypernetwork.compiled, state):
-            given = (own.contiguous(), state, *self.hypernetwork.parameters())
-            return _CompiledMixed.apply(self.width, torch.is_grad_enabled(), *given).view(values.shape[:-1])  # type: ignore[no-untyped-call]
+            mixer, inputs = partial(CompiledMixer, self.width), [own.contiguous(), state]
+            return passed(mixer, inputs, [*self.hypernetwork.parameters()]).view(values.shape[:-1])
         seen, size = state.reshape(len(state), -1, state.shape[-1]), max(1, CACHED_ROWS // values.shape[0])
         pieces = [self._mixed(*piece) for piece in zip(own.split(size, 1), seen.split(size, 1), strict=True)]
         return torch.cat(pieces, 1).view(values.shape[:-1])
@@ -166,19 +166,3 @@ class MonotonicMixer(nn.Module):
         weighed = first.unflatten(1, (self.num_agents, self.width)).abs() * own.transpose(1, 2).unsqueeze(2)
         hidden = elu(weighed.sum(1) + bias)
         return (hidden * second.abs()).sum(1) + offset.squeeze(1)
-
-
-class _CompiledMixed(Function):
-    """The mixer by the kernel, hypernetwork and all: own [S, B, N] in states [S, ..., width] to [S, B]."""
-
-    @staticmethod
-    def forward(ctx, width, keep, own, state, *parameters):  # type: ignore[no-untyped-def]
-        ctx.run = CompiledMixer(own, [state], parameters, width, keep)
-        ctx.save_for_backward(own, state, *parameters)  # so that autograd notices a change of them
-        return ctx.run.outputs.detach()  # the tensor itself would hold, by its grad_fn, what holds it
-
-    @staticmethod
-    def backward(ctx, grad):  # type: ignore[no-untyped-def]
-        _, state, *_ = ctx.saved_tensors
-        by_own, grads, (by_state,) = ctx.run.unmix(grad, ctx.needs_input_grad[4:], ctx.needs_input_grad[3:4])
-        return None, None, by_own, None if by_state is None else by_state.view(state.shape), *grads

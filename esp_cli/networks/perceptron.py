@@ -8,9 +8,9 @@ the same and is the reference in the tests.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import accumulate, pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -43,9 +43,17 @@ def perceptron(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tens
 
     The inputs [S, ..., d] are parts of x, side by side; gradients flow to those that ask for them.
     """
+    return passed(partial(_pass, shape), inputs, parameters).unflatten(1, inputs[0].shape[1:-1])
+
+
+def passed(make: Callable[..., Any], inputs: Sequence[Tensor], parameters: Sequence[Tensor]) -> Tensor:
+    """Return the outputs of `make(inputs, parameters, keep)`, through which gradients flow where there is a graph.
+
+    What it makes has `outputs`, and where it is to `keep` what it needs for that `backward_to`; see `_Pass`.
+    """
     if torch.is_grad_enabled():
-        return _Perceptron.apply(shape, len(inputs), *inputs, *parameters)  # type: ignore[no-untyped-call]
-    return _pass(shape, inputs, parameters, keep=False).outputs.unflatten(1, inputs[0].shape[1:-1])
+        return _Passed.apply(make, len(inputs), *inputs, *parameters)  # type: ignore[no-untyped-call]
+    return make(inputs, parameters, keep=False).outputs
 
 
 def perceptron_with_vjp(
@@ -161,21 +169,19 @@ class _Pass:
         return grads, [torch.cat(parts, 1).float() if parts else None for parts in below]
 
 
-class _Perceptron(Function):
-    """`perceptron` under autograd."""
+class _Passed(Function):
+    """`passed` under autograd."""
 
     @staticmethod
-    def forward(ctx, shape, num_inputs, *tensors):  # type: ignore[no-untyped-def]
-        inputs = tensors[:num_inputs]
-        ctx.num_inputs, ctx.run = num_inputs, _pass(shape, inputs, tensors[num_inputs:], keep=True)
+    def forward(ctx, make, num_inputs, *tensors):  # type: ignore[no-untyped-def]
+        ctx.num_inputs, ctx.run = num_inputs, make(tensors[:num_inputs], tensors[num_inputs:], keep=True)
         ctx.save_for_backward(*tensors)  # so that autograd notices a change of them
-        return ctx.run.outputs.detach().unflatten(1, inputs[0].shape[1:-1])
+        return ctx.run.outputs.detach()  # the tensor itself would hold, by its grad_fn, what holds it
 
     @staticmethod
     def backward(ctx, grad):  # type: ignore[no-untyped-def]
         inputs, first = ctx.saved_tensors[: ctx.num_inputs], 2 + ctx.num_inputs
-        learns, asked = ctx.needs_input_grad[first:], ctx.needs_input_grad[2:first]
-        grads, below = ctx.run.backward_to(grad.flatten(1, -2), learns, asked)
+        grads, below = ctx.run.backward_to(grad, ctx.needs_input_grad[first:], ctx.needs_input_grad[2:first])
         below = [None if by_x is None else by_x.view(x.shape) for by_x, x in zip(below, inputs, strict=True)]
         return None, None, *below, *grads
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import ClassVar, Literal
 
@@ -9,10 +10,10 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from esp_cli.networks.contract import VJP, ActivationName, Generators, IoSpec, Memoryless, Network, NetworkConfig
-from esp_cli.networks.kernels.library import WORTH_COMPILING, has_compiler
+from esp_cli.networks.contract import ActivationName, Generators, IoSpec, Memoryless, Network, NetworkConfig, WithVJP
+from esp_cli.networks.kernels.library import WORTH_COMPILING, computes, has_compiler
 from esp_cli.networks.layers import GAINS, SeedLayerNorm, SeedLinear, SeedMLP
-from esp_cli.networks.perceptron import Shape, perceptron
+from esp_cli.networks.perceptron import Deferred, Shape, perceptron, perceptron_with_vjp
 from esp_cli.networks.recurrent import SeedGRU
 from esp_envs.errors import UserError
 
@@ -109,8 +110,13 @@ class MLP(SeedMLP, Memoryless):
     def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
         return self(x)
 
-    def unroll_with_vjp(self, x: Tensor, truncation: int = 0) -> tuple[Tensor, VJP]:
-        return super().unroll_with_vjp(x, truncation) if self.norms is not None else self.forward_with_vjp(x)
+    def with_vjp(self, x: Tensor, shape: Sequence[int], truncation: int = 0, defer: bool = True) -> WithVJP:
+        if self.norms is not None:
+            return super().with_vjp(x, shape, truncation)
+        if defer and computes(self.compiled, x):
+            return Deferred(self._shape(), x, self.learned, shape)
+        outputs, vjp = perceptron_with_vjp(self._shape(), [x], self.learned)
+        return WithVJP(outputs.reshape(shape), lambda slope: vjp(slope.reshape(outputs.shape)), self.learned)
 
 
 class GRU(Network):

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from torch import Tensor, nn
-from torch.autograd import Function
 
 from esp_cli.networks.kernels.library import begin, computes
 from esp_cli.networks.kernels.recurrent import CompiledUnroll
 from esp_cli.networks.layers import SeedLinear
-from esp_cli.networks.perceptron import activate_
+from esp_cli.networks.perceptron import activate_, passed
 
 
 class SeedGRU(nn.Module):
@@ -42,15 +42,8 @@ class SeedGRU(nn.Module):
 
     def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
         """Advance through whole episodes from empty memory: x [S, T, B, in] -> every memory [S, T, B, H]."""
-        layers = (self.input.weight, self.input.bias, self.recurrent.weight, self.recurrent.bias)
-        if torch.is_grad_enabled():
-            return _Unrolled.apply(x, truncation, self.compiled, *layers)  # type: ignore[no-untyped-call]
-        return _run(x, truncation, self.compiled, layers, keep=False).memories
-
-
-def _run(x: Tensor, truncation: int, compiled: bool, layers: Sequence[Tensor], keep: bool) -> _Unroll | CompiledUnroll:
-    """Return a run by the kernel where it is chosen, else by torch's operations."""
-    return (CompiledUnroll if computes(compiled, x) else _Unroll)(x, layers, truncation, keep)
+        unroll = CompiledUnroll if computes(self.compiled, x) else _Unroll
+        return passed(partial(unroll, truncation), [x], [*self.parameters()])
 
 
 def _gates(weight: Tensor) -> Tensor:
@@ -59,10 +52,10 @@ def _gates(weight: Tensor) -> Tensor:
 
 
 class _Unroll:
-    """All steps of a gated recurrent unit from empty memory by torch, of x [S, T, B, in]."""
+    """All steps of a gated recurrent unit by torch, from empty memory; see `CompiledUnroll`."""
 
-    def __init__(self, x: Tensor, layers: Sequence[Tensor], truncation: int, keep: bool) -> None:
-        weight, bias, recurrent, inner_bias = layers
+    def __init__(self, truncation: int, inputs: Sequence[Tensor], layers: Sequence[Tensor], keep: bool) -> None:
+        (x,), (weight, bias, recurrent, inner_bias) = inputs, layers
         self._x, self._weights, self._truncation = x, (weight, recurrent), truncation
         (w_r, w_z, w_n), (u_r, u_z, u_n) = _gates(weight), _gates(recurrent)
         (b_r, b_z, _), (_, _, c_n), (_, _, b_n) = _gates(bias + inner_bias), _gates(inner_bias), _gates(bias)
@@ -82,10 +75,10 @@ class _Unroll:
             torch.baddbmm(b_n, now, w_n, out=candidate).addcmul_(reset, inner)
             activate_(candidate, "tanh")
             torch.lerp(candidate, memory, update, out=self._all[:, t + 1])
-        self.memories = self._all[:, 1:]
+        self.outputs = self._all[:, 1:]
 
-    def backward(self, grad: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """Return the gradients by x and by the layers of what has this gradient by the memories."""
+    def backward_to(self, grad: Tensor, *_: Sequence[bool]) -> tuple[list[Tensor], list[Tensor]]:
+        """Return the gradients by all layers and by x of what has this gradient by the memories."""
         x, learned = self._x, _Learned(*self._weights)
         by_x, carry = torch.empty_like(x), torch.zeros_like(self._all[:, 0])
         d = carry.new_empty(4, *carry.shape)  # by r, z and n before their activations, and by h U_n + b_n
@@ -104,23 +97,7 @@ class _Unroll:
                 carry.zero_()
             else:
                 carry = learned.through_time(d, passed)
-        return by_x, learned.gradients()
-
-
-class _Unrolled(Function):
-    """All steps of a gated recurrent unit; `SeedGRU.forward` under autograd is the reference in the tests."""
-
-    @staticmethod
-    def forward(ctx, x, truncation, compiled, *layers):  # type: ignore[no-untyped-def]
-        ctx.run = _run(x, truncation, compiled, layers, keep=True)
-        ctx.save_for_backward(x, *layers)  # so that autograd notices a change of them
-        return ctx.run.memories.detach()  # the tensor itself would hold, by its grad_fn, what holds it
-
-    @staticmethod
-    def backward(ctx, grad):  # type: ignore[no-untyped-def]
-        _ = ctx.saved_tensors
-        by_x, by_layers = ctx.run.backward(grad)
-        return by_x, None, None, *by_layers
+        return learned.gradients(), [by_x]
 
 
 class _Learned:
