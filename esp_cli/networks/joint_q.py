@@ -126,8 +126,8 @@ def _one_by_one(network: nn.Module, rows: Tensor, items: Tensor, others: Tensor)
     num_rows, num_items, num_others = others.shape[1:4]
     own = torch.eye(num_items, dtype=torch.bool, device=rows.device).view(num_items, 1, num_items, 1)
     joint = torch.where(own, others.unsqueeze(4), items.view(-1, num_rows, 1, 1, *items.shape[2:])).flatten(-2)
-    full = torch.cat([rows.view(-1, num_rows, 1, 1, rows.shape[-1]).expand(*joint.shape[:-1], -1), joint], -1)
-    return network(full.flatten(1, 3)).unflatten(1, (num_rows, num_items, num_others))
+    here = rows.view(-1, num_rows, 1, 1, rows.shape[-1]).expand(*joint.shape[:-1], -1)
+    return network(here.flatten(1, 3), joint.flatten(1, 3)).unflatten(1, (num_rows, num_items, num_others))
 
 
 HYPER_GAIN = 0.5  # orthogonal gain of the hypernetwork's last layer

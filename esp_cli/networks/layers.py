@@ -91,11 +91,8 @@ class SeedMLP(nn.Module):
         return self._from_layer(0, parts, rows_innermost)
 
     def from_first_sums(self, sums: Tensor) -> Tensor:
-        """Map the first layer's sums x W_1 + b_1 [S, B, H] to [S, B, out], in place; not with layer normalisation."""
-        if len(self.layers) == 1 and not self.activate_output:
-            return sums.float()
-        x = activate_(sums, self.activation)
-        return x.float() if len(self.layers) == 1 else self._from_layer(1, [x])
+        """Map the first hidden layer's sums x W_1 + b_1 [S, B, H] to [S, B, out], in place; not where it is normed."""
+        return self._from_layer(1, [activate_(sums, self.activation)])
 
     def _from_layer(self, first: int, parts: Sequence[Tensor], rows_innermost: bool = False) -> Tensor:
         return perceptron(self._shape(rows_innermost), parts, self._from(first))

@@ -170,8 +170,6 @@ class _Pass:
 
 
 class _Passed(Function):
-    """`passed` under autograd."""
-
     @staticmethod
     def forward(ctx, make, num_inputs, *tensors):  # type: ignore[no-untyped-def]
         ctx.num_inputs, ctx.run = num_inputs, make(tensors[:num_inputs], tensors[num_inputs:], keep=True)

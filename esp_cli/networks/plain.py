@@ -50,6 +50,11 @@ class PlainConfig(CompiledConfig):
         False, description="discrete wheel pairs: one output per speed of each wheel; a pair's output is their sum"
     )
 
+    def build(
+        self, generators: Generators, inputs: int, outputs: int, output_gain: float, io: IoSpec | None
+    ) -> Network:
+        return (GRU if self.recurrent else MLP)(generators, inputs, outputs, self, output_gain)
+
     @property
     def products(self) -> tuple[torch.dtype, bool]:
         """How networks compute: the precision as torch names it, and whether by kernels."""
@@ -79,11 +84,6 @@ class MlpConfig(PlainConfig):
 
     name: Literal["mlp"] = "mlp"
 
-    def build(
-        self, generators: Generators, inputs: int, outputs: int, output_gain: float, io: IoSpec | None
-    ) -> Network:
-        return MLP(generators, inputs, outputs, self, output_gain)
-
 
 class GruConfig(PlainConfig):
     """The settings of a recurrent network."""
@@ -91,11 +91,6 @@ class GruConfig(PlainConfig):
     recurrent: ClassVar[bool] = True
 
     name: Literal["gru"] = "gru"
-
-    def build(
-        self, generators: Generators, inputs: int, outputs: int, output_gain: float, io: IoSpec | None
-    ) -> Network:
-        return GRU(generators, inputs, outputs, self, output_gain)
 
 
 class MLP(SeedMLP, Memoryless):

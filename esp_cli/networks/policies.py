@@ -146,7 +146,6 @@ def _index(action: Tensor, learned: int) -> Tensor:
 
 
 def _beside(weights: Weights) -> Weights:
-    """Return weights shaped to stand beside numbers of actions."""
     return weights.unsqueeze(1) if isinstance(weights, Tensor) else weights
 
 
@@ -220,7 +219,6 @@ class GaussianPolicies:
         return torch.zeros_like(self._means), torch.zeros_like(self._deviation.tensor)
 
     def _of(self, x: Tensor, parts: slice) -> Tensor:
-        """Return deviations or items of some parts."""
         return x if len(x[0]) == 1 else x[:, parts]
 
     def _add_by_items(self, total: Tensor, slopes: Tensor, parts: slice) -> None:

@@ -79,51 +79,30 @@ class _Unroll:
 
     def backward_to(self, grad: Tensor, *_: Sequence[bool]) -> tuple[list[Tensor], list[Tensor]]:
         """Return the gradients by all layers and by x of what has this gradient by the memories."""
-        x, learned = self._x, _Learned(*self._weights)
+        x, (inputs, memories) = self._x, map(_gates, self._weights)
+        by_inputs, by_memories = torch.zeros_like(inputs), torch.zeros_like(memories)
         by_x, carry = torch.empty_like(x), torch.zeros_like(self._all[:, 0])
         d = carry.new_empty(4, *carry.shape)  # by r, z and n before their activations, and by h U_n + b_n
-        gap = torch.empty_like(carry)
+        gap, by_sums = torch.empty_like(carry), carry.new_zeros(4, len(carry), 1, carry.shape[2])
+        (w_r, w_z, w_n), (u_r, u_z, u_n) = inputs.transpose(2, 3), memories.transpose(2, 3)
         for t, (gates, inner) in reversed([*enumerate(self._kept)]):
             (reset, update, candidate), before = gates, self._all[:, t]
             carry += grad[:, t]
-            passed = carry * update
-            torch.ops.aten.tanh_backward.grad_input(torch.sub(carry, passed, out=gap), candidate, grad_input=d[2])
+            past = carry * update
+            torch.ops.aten.tanh_backward.grad_input(torch.sub(carry, past, out=gap), candidate, grad_input=d[2])
             torch.mul(d[2], inner, out=d[0])
             torch.mul(torch.sub(before, candidate, out=gap), carry, out=d[1])
             torch.ops.aten.sigmoid_backward.grad_input(d[:2], gates[:2], grad_input=d[:2])
             torch.mul(d[2], reset, out=d[3])
-            by_x[:, t] = learned.add(d, x[:, t], before)
+            by_sums += d.sum(2, keepdim=True)
+            for k, by_memory in enumerate((0, 1, 3)):
+                by_inputs[k].baddbmm_(x[:, t].transpose(1, 2), d[k])
+                by_memories[k].baddbmm_(before.transpose(1, 2), d[by_memory])
+            by_x[:, t] = torch.bmm(d[0], w_r).baddbmm_(d[1], w_z).baddbmm_(d[2], w_n)
             if self._truncation and t % self._truncation == 0:
                 carry.zero_()
             else:
-                carry = learned.through_time(d, passed)
-        return learned.gradients(), [by_x]
-
-
-class _Learned:
-    """The weights of a gated recurrent unit by gates, and the gradients by them, a sum over the steps."""
-
-    def __init__(self, weight: Tensor, recurrent: Tensor) -> None:
-        self.inputs, self.memories = _gates(weight), _gates(recurrent)
-        self.by_inputs, self.by_memories = torch.zeros_like(self.inputs), torch.zeros_like(self.memories)
-        self.by_sums = weight.new_zeros(4, weight.shape[0], 1, self.inputs.shape[-1])
-
-    def add(self, d: Tensor, x: Tensor, memory: Tensor) -> Tensor:
-        """Add a step's gradients, known those by its sums [4, S, B, H], and return that by its input [S, B, in]."""
-        x, memory = x.transpose(1, 2), memory.transpose(1, 2)
-        self.by_sums += d.sum(2, keepdim=True)
-        for k, (by_input, by_memory) in enumerate(zip(self.by_inputs, self.by_memories, strict=True)):
-            by_input.baddbmm_(x, d[k])
-            by_memory.baddbmm_(memory, d[k if k < 2 else 3])
-        w_r, w_z, w_n = self.inputs.transpose(2, 3)
-        return torch.bmm(d[0], w_r).baddbmm_(d[1], w_z).baddbmm_(d[2], w_n)
-
-    def through_time(self, d: Tensor, passed: Tensor) -> Tensor:
-        """Return the gradient by the memory before a step, added to what passes it by; in place."""
-        u_r, u_z, u_n = self.memories.transpose(2, 3)
-        return passed.baddbmm_(d[0], u_r).baddbmm_(d[1], u_z).baddbmm_(d[3], u_n)
-
-    def gradients(self) -> list[Tensor]:
-        r, z, n, inner = self.by_sums
-        parts = ((*self.by_inputs,), (r, z, n), (*self.by_memories,), (r, z, inner))
-        return [torch.cat(gates, -1) for gates in parts]
+                carry = past.baddbmm_(d[0], u_r).baddbmm_(d[1], u_z).baddbmm_(d[3], u_n)
+        r, z, n, inner = by_sums
+        parts = (by_inputs.unbind(0), (r, z, n), by_memories.unbind(0), (r, z, inner))
+        return [torch.cat(gates, -1) for gates in parts], [by_x]
