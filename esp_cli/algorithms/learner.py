@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, ClassVar
@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from esp_cli.algorithms.adam import SeedAdam
 from esp_cli.files.documents import Strict
-from esp_cli.networks.contract import NetworkConfig
+from esp_cli.networks.contract import Generators, NetworkConfig
 from esp_cli.networks.policy import Policy
 from esp_cli.prior import PriorConfig, SymmetryPrior
 from esp_envs.base import Environment, generator_states, restore_generators
@@ -43,7 +43,7 @@ class LearnerConfig(Strict):
 class Worlds:
     """Acts in the training worlds and remembers where each stands."""
 
-    def __init__(self, env: Environment, policy: Any, generators: Sequence[torch.Generator]) -> None:
+    def __init__(self, env: Environment, policy: Any, generators: Generators) -> None:
         self.env, self.policy, self.generators = env, policy, generators
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -98,8 +98,8 @@ class Learner(ABC):
         config: Any,
         network: NetworkConfig,
         prior: PriorConfig,
-        generators: Sequence[torch.Generator],
-        prior_generators: Sequence[torch.Generator],
+        generators: Generators,
+        prior_generators: Generators,
     ) -> None:
         self.config, self.spec, self.device = config, env.spec, env.device
         self.prior = SymmetryPrior(prior, env.spec, env.device, self.replays)
@@ -116,7 +116,7 @@ class Learner(ABC):
 
     @classmethod
     @abstractmethod
-    def build_policy(cls, spec: TaskSpec, network: NetworkConfig, generators: Sequence[torch.Generator]) -> Policy:
+    def build_policy(cls, spec: TaskSpec, network: NetworkConfig, generators: Generators) -> Policy:
         """Return new policies of the kind that this algorithm trains, one per generator."""
 
     @property

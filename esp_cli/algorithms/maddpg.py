@@ -7,7 +7,7 @@ actions, and the actor follows its gradient. Supplement eq. 19 is added to the c
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Literal
 
 import torch
@@ -19,7 +19,7 @@ from esp_cli.algorithms.objectives import value_loss
 from esp_cli.algorithms.off_policy import ExploringConfig, ExploringLearner
 from esp_cli.algorithms.replay import EpisodeBatch
 from esp_cli.networks.build import perceptron
-from esp_cli.networks.contract import IoSpec, NetworkConfig
+from esp_cli.networks.contract import Generators, IoSpec, NetworkConfig
 from esp_cli.networks.exploration import ActorHead, ExploringCategorical, build_actor_head
 from esp_cli.networks.heads import drawn
 from esp_cli.networks.joint_q import PerAgentCriticInput
@@ -92,9 +92,7 @@ class Maddpg(ExploringLearner):
         self._value_scale = spec.horizon**0.5
 
     @classmethod
-    def build_policy(
-        cls, spec: TaskSpec, network: NetworkConfig, generators: Sequence[torch.Generator]
-    ) -> HistoryPolicy:
+    def build_policy(cls, spec: TaskSpec, network: NetworkConfig, generators: Generators) -> HistoryPolicy:
         return HistoryPolicy(spec, network, generators, build_actor_head(spec.action, len(generators)), POLICY_GAIN)
 
     def update(self, batch: EpisodeBatch) -> dict[str, Tensor]:

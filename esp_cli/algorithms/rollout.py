@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.algorithms.learner import Worlds
+from esp_cli.networks.contract import Generators
 from esp_cli.networks.policy import Critic, StochasticPolicy
 from esp_cli.prior import SeedBatch
 from esp_envs.base import Environment, Observation
@@ -53,7 +54,7 @@ class Batch(SeedBatch):
 class Collector(Worlds):
     """Acts in the worlds and remembers, between rollouts, where each stands."""
 
-    def __init__(self, env: Environment, policy: StochasticPolicy, generators: Sequence[torch.Generator]) -> None:
+    def __init__(self, env: Environment, policy: StochasticPolicy, generators: Generators) -> None:
         super().__init__(env, policy, generators)
         self._begin()
         self.finished_return = torch.zeros(env.num_seeds, device=env.device)

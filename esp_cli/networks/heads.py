@@ -24,7 +24,6 @@ from esp_cli.networks.policies import (
     CompiledCategoricalPolicies,
     GaussianPolicies,
     Policies,
-    divergence_by_choice,
 )
 from esp_cli.symmetry.frame import Frame
 from esp_envs.spec import ActionSpace, Continuous, Discrete
@@ -118,10 +117,6 @@ class Categorical(Choice):
         """Return - sum_a pi(a) log pi(a): [S, B, N]."""
         return -(log_probs.exp() * log_probs).sum(-1)
 
-    def divergence(self, p: Tensor, q: Tensor) -> Tensor:
-        """Return KL[p || q] of two sets of log-probabilities: [S, B, N]."""
-        return divergence_by_choice(p, q, p.exp()).sum(-1)
-
     def policies(self, outputs: WithVJP, frame: Frame) -> Policies:
         """Return the policies that outputs [S, P B, T, N, A] are, for losses with slopes."""
         compiled = outputs.waits or computes(self.compiled, outputs.tensor)
@@ -184,10 +179,6 @@ class BoundedGaussian(Bounded):
     def entropy(self, outputs: Tensor) -> Tensor:
         entropy = (self.log_deviation(outputs) + 0.5 * math.log(2 * math.pi * math.e)).sum(-1)
         return entropy.expand(outputs.shape[:-1])
-
-    def divergence(self, p: Tensor, q: Tensor) -> Tensor:
-        """Return KL between two Gaussians that share their deviation: |mean_p - mean_q|^2 / (2 std^2)."""
-        return (0.5 * ((p - q) * (-self.log_deviation(p)).exp()).square()).sum(-1)
 
     def to_environment(self, action: Tensor) -> Tensor:
         return squash(action, self.disc)

@@ -36,17 +36,9 @@ class SharedCriticInput:
         """Return what the critic sees of scenes with obs [S, W, N, D] and state [S, W, G]: [S, W, width]."""
         return state if self.reads == "state" else obs.flatten(-2)
 
-    def inputs(self, seen: Tensor, action: Tensor) -> Tensor:
-        """Return the critic's inputs [S, ..., D] for encoded joint actions [S, W, N, A]."""
-        return torch.cat([seen, self.joint_action(action)], -1)
-
-    def joint_action(self, action: Tensor) -> Tensor:
-        """Return encoded joint actions [S, W, N, A] as the critic reads them: [S, ..., N A]."""
-        return action.flatten(-2)
-
     def value(self, critic: nn.Module, seen: Tensor, action: Tensor) -> Tensor:
         """Return Q [S, W, C] of encoded joint actions [S, W, N, A]; `seen` is what the critic sees of the scenes."""
-        return critic(seen, self.joint_action(action))
+        return critic(seen, action.flatten(-2))
 
     def exchanged(self, critic: nn.Module, seen: Tensor, joint: Tensor, others: Tensor) -> Tensor:
         """Return each agent's Q [S, W, N, K] for its other actions, with the actions of all others fixed.
@@ -74,12 +66,8 @@ class PerAgentCriticInput(SharedCriticInput):
             return in_circular_order(obs)
         return torch.cat([state.unsqueeze(-2).expand(*obs.shape[:-1], -1), obs], -1)
 
-    def joint_action(self, action: Tensor) -> Tensor:
-        """Return encoded joint actions [S, W, N, A] for each agent: [S, W, N, N A]."""
-        return in_circular_order(action)
-
     def value(self, critic: nn.Module, seen: Tensor, action: Tensor) -> Tensor:
-        return super().value(critic, seen, action).squeeze(-1)
+        return critic(seen, in_circular_order(action)).squeeze(-1)
 
     def exchanged(self, critic: nn.Module, seen: Tensor, joint: Tensor, others: Tensor) -> Tensor:
         """Return each agent's own Q for its other actions: [S, W, N, K]; arguments as of `SharedCriticInput`."""

@@ -102,12 +102,8 @@ def _pass(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor], 
 
 def _pieces(shape: Shape, inputs: Sequence[Tensor]) -> Iterator[Tensor]:
     """Return rows whose numbers lie side by side, some at a time."""
-    for parts in zip(*(_split(x, _size(x)) for x in inputs), strict=True):
+    for parts in zip(*(x.split(_size(x), 1) for x in inputs), strict=True):
         yield (parts[0] if len(parts) == 1 else torch.cat(parts, -1)).to(shape.precision)
-
-
-def _split(x: Tensor, size: int) -> Sequence[Tensor]:
-    return x.split(size, 1) if x.shape[1] > size else (x,)
 
 
 def _size(x: Tensor) -> int:
@@ -159,7 +155,7 @@ class _Pass:
         grads: list[Tensor | None] = [None] * (2 * len(weights))
         below: list[list[Tensor]] = [[] for _ in asked]
         columns = list(zip(asked, pairwise(accumulate(self._widths, initial=0)), below, strict=False))
-        for run, upper in zip(self._runs, _split(grad.to(shape.precision), self._size), strict=True):
+        for run, upper in zip(self._runs, grad.to(shape.precision).split(self._size, 1), strict=True):
             here = _backward(shape, run, upper, weights, learns, grads)
             for wanted, (begin, end), parts in columns:
                 if wanted:

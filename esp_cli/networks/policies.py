@@ -56,7 +56,7 @@ class CategoricalPolicies:
 
     def _gap(self, copies: slice, originals: slice) -> Tensor:
         p, log_p, log_q = self.probs[:, :, copies], self.log_probs[:, :, copies], self.log_probs[:, :, originals]
-        return divergence_by_choice(log_p, log_q, p)
+        return p * (log_p - log_q)
 
     def add_slope(self, slope: Tensor | None, action: Tensor, by_log_prob: Tensor, by_entropy: Weights) -> Tensor:
         """Add the slope of what depends on log pi(action), by which it is [S, L, R], and on these entropies."""
@@ -133,11 +133,6 @@ def _places(orders: Tensor) -> Tensor:
     seeds, parts = (torch.arange(count, device=orders.device) for count in (num_seeds, num_parts))
     first = (num_actions * num_parts * seeds).view(-1, 1, 1) + parts
     return torch.add(first, orders.transpose(1, 2), alpha=num_parts).flatten()
-
-
-def divergence_by_choice(log_p: Tensor, log_q: Tensor, p: Tensor) -> Tensor:
-    """Return p (log p - log q) for each choice, whose sum over the choices is KL[p || q]."""
-    return p * (log_p - log_q)
 
 
 def _index(action: Tensor, learned: int) -> Tensor:

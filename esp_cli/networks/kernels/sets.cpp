@@ -8,13 +8,6 @@ namespace {
 
 constexpr int64_t ROWS = 64;  // of a task
 
-template <class Work>
-void each_rows(int64_t rows, int64_t threads, int64_t room, Work work) {
-    const Shares shares(1, rows, ROWS, threads);
-    share_out(
-        shares, 0, room, [](int64_t) {}, [&](int64_t task, float *own) { work(shares.of(task), own); }, [](int64_t) {});
-}
-
 Vec root(Vec x) {
     for (int i = 0; i < LANES; i++) x[i] = std::sqrt(x[i]);
     return x;
@@ -29,7 +22,9 @@ extern "C" {
 void distances(const int64_t *shape, const int64_t *sizes, const float *places, float *to) {
     const int64_t rows = shape[0], things = shape[1], families = shape[2], columns = families + 1;
     // LANES rows at a time, a vector for each coordinate of each thing
-    each_rows(rows, shape[3], 2 * things * LANES, [&](Span span, float *own) {
+    const Shares shares(1, rows, ROWS, shape[3]);
+    auto work = [&](int64_t task, float *own) {
+        const Span span = shares.of(task);
         for (int64_t begin = span.begin; begin < span.end; begin += LANES) {
             int64_t count = std::min<int64_t>(LANES, span.end - begin);
             for (int64_t k = 0; k < 2 * things; k++)
@@ -58,7 +53,8 @@ void distances(const int64_t *shape, const int64_t *sizes, const float *places, 
                 }
             }
         }
-    });
+    };
+    share_out(shares, 0, 2 * things * LANES, [](int64_t) {}, work, [](int64_t) {});
 }
 
 // Pass the things of sets, [S, R K, in], through a perceptron that ends with an activation, and write mean and maximum
