@@ -91,7 +91,9 @@ class SeedMLP(nn.Module):
         return self._from_layer(0, parts, rows_innermost)
 
     def from_first_sums(self, sums: Tensor) -> Tensor:
-        """Map the first hidden layer's sums x W_1 + b_1 [S, B, H] to [S, B, out], in place; not where it is normed."""
+        """Map the first layer's sums x W_1 + b_1 [S, B, H] to [S, B, out], in place; not normed, nor activated last."""
+        if len(self.layers) == 1:
+            return sums.float()
         return self._from_layer(1, [activate_(sums, self.activation)])
 
     def _from_layer(self, first: int, parts: Sequence[Tensor], rows_innermost: bool = False) -> Tensor:

@@ -26,9 +26,8 @@ def test_a_circle_ends_with_each_item_in_turn():
 
 def test_by_hand():
     """Two items of one number, 1 and 2, weighed by 3 and 5, become 10 or 30 and 20 or 40, beside 7 weighed by 1."""
-    network = perceptron((3, 1, 1))
+    network = perceptron((3, 1))
     network.layers[0].weight.data[:] = torch.tensor([1.0, 3.0, 5.0]).view(1, 3, 1)
-    network.layers[1].weight.data.fill_(1.0)
     rows = torch.full((2, 1, 1), 7.0)
     items = torch.tensor([1.0, 2.0]).view(1, 1, 2, 1).expand(2, -1, -1, -1)
     others = torch.tensor([[10.0, 30.0], [20.0, 40.0]]).view(1, 1, 2, 2, 1).expand(2, -1, -1, -1, -1)
@@ -38,7 +37,7 @@ def test_by_hand():
 
 
 @pytest.mark.parametrize("activation", ["relu", "tanh"])
-@pytest.mark.parametrize("sizes", [(18, 16, 1), (18, 16, 8, 3)])
+@pytest.mark.parametrize("sizes", [(18, 2), (18, 16, 1), (18, 16, 8, 3)])
 def test_values_and_gradients_are_those_of_every_row_asked_for_by_itself(sizes, activation):
     network = perceptron(sizes).requires_grad_(False)
     network.activation = activation
