@@ -5,21 +5,37 @@ Shape letters: S seeds, B rows, N agents, K things of a family, W numbers and H 
 
 from __future__ import annotations
 
+from abc import ABC
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Annotated, ClassVar
 
 import torch
+from pydantic import Field as Setting
 from torch import Tensor, nn
 
-from esp_cli.networks.contract import Generators, IoSpec
+from esp_cli.networks.contract import ActivationName, Generators, IoSpec
 from esp_cli.networks.kernels.library import begin, computes
 from esp_cli.networks.kernels.sets import compiled_distances, compiled_pool
 from esp_cli.networks.layers import GAINS, SeedMLP
+from esp_cli.networks.plain import CompiledConfig
 from esp_envs.errors import UserError
 from esp_envs.spec import Family, Kind, Layout
 
-if TYPE_CHECKING:
-    from esp_cli.networks.sets import SetConfig
+
+class SetShape(CompiledConfig, ABC):
+    """The settings of networks over sets."""
+
+    free_of_counts: ClassVar[bool] = True
+
+    activation: ActivationName = Setting("relu", description="of the actor")
+    hidden: tuple[Annotated[int, Setting(ge=1, le=4096)], ...] = Setting(
+        (64,), min_length=1, max_length=16, description="hidden widths behind the sets"
+    )
+    width: int = Setting(32, ge=1, le=4096, description="features of each thing of a set")
+
+    @property
+    def rows(self) -> type[Rows]:
+        return Rows
 
 
 class Rows:
@@ -111,7 +127,7 @@ def distances_among(places: Sequence[Tensor]) -> list[Tensor]:
 class Embedding(SeedMLP):
     """A perceptron that ends with an activation, shared by like things."""
 
-    def __init__(self, generators: Generators, sizes: Sequence[int], config: SetConfig) -> None:
+    def __init__(self, generators: Generators, sizes: Sequence[int], config: SetShape) -> None:
         name = config.activation
         super().__init__(generators, sizes, name, GAINS[name], activate_output=True, compiled=config.compiled is True)
 
@@ -126,7 +142,7 @@ class Embedding(SeedMLP):
 class SetEncoder(nn.Module):
     """Features [S, B, width] of rows that show sets."""
 
-    def __init__(self, generators: Generators, rows: Rows, config: SetConfig) -> None:
+    def __init__(self, generators: Generators, rows: Rows, config: SetShape) -> None:
         super().__init__()
         self.rows, features = rows, config.width
         self.own = Embedding(generators, (rows.num_own, features), config) if rows.num_own > features else None
@@ -161,7 +177,7 @@ class TeamFeatures(nn.Module):
     """
 
     def __init__(
-        self, generators: Generators, io: IoSpec, config: SetConfig, beside: int = 0, rows: Rows | None = None
+        self, generators: Generators, io: IoSpec, config: SetShape, beside: int = 0, rows: Rows | None = None
     ) -> None:
         super().__init__()
         spaces, compiled, joint = io.spaces, config.compiled is True, io.reads == "observations"

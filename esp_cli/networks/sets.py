@@ -11,35 +11,22 @@ Shape letters: S seeds, B rows, N agents, H features of a thing.
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import Literal
 
 import torch
-from pydantic import Field as Setting
 from torch import Tensor, nn
 
-from esp_cli.networks.contract import ActivationName, Generators, IoSpec, Memoryless, Network
+from esp_cli.networks.contract import Generators, IoSpec, Memoryless, Network
 from esp_cli.networks.joint_q import HYPER_GAIN
 from esp_cli.networks.layers import SeedMLP
-from esp_cli.networks.plain import CompiledConfig
-from esp_cli.networks.set_features import Rows, TeamFeatures, along
+from esp_cli.networks.set_features import Rows, SetShape, TeamFeatures, along
 from esp_envs.errors import UserError
 
 
-class SetConfig(CompiledConfig):
+class SetConfig(SetShape):
     """The settings of the network over sets."""
 
-    free_of_counts: ClassVar[bool] = True
-
     name: Literal["set"] = "set"
-    activation: ActivationName = Setting("relu", description="of the actor")
-    hidden: tuple[Annotated[int, Setting(ge=1, le=4096)], ...] = Setting(
-        (64,), min_length=1, max_length=16, description="hidden widths behind the sets"
-    )
-    width: int = Setting(32, ge=1, le=4096, description="features of each thing of a set")
-
-    @property
-    def rows(self) -> type[Rows]:
-        return Rows
 
     def build(
         self, generators: Generators, inputs: int, outputs: int, output_gain: float, io: IoSpec | None
