@@ -108,6 +108,23 @@ static float nearest(const float *at, const float *places, int count, int width,
     return none;
 }
 
+/* Copies the `near` things with the nearest places, and returns how many they are. */
+static int nearest_things(const float *things, int count, int width, int place, const float *from, int near,
+                          float *to)
+{
+    int i, j, copied = 0;
+    for (i = 0; i < count; i++) {
+        const float mine = apart(things + i * width + place, from);
+        int before = 0;
+        for (j = 0; j < count && before < near; j++) {
+            const float square = apart(things + j * width + place, from);
+            before += square < mine || (square == mine && j < i);
+        }
+        if (before < near && copied < near) memcpy(to + width * copied++, things + i * width, sizeof(float) * width);
+    }
+    return copied;
+}
+
 /* Adds the features of the i-th of `count` things to their mean, and takes the maximum behind it. */
 static void pool(int features, int i, int count, const float *x, float *y)
 {

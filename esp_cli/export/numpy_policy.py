@@ -148,13 +148,18 @@ def _pool_sets(x: Any, layer: dict[str, Any], arrays: list[Any], tables: Any) ->
     if layer["embeds_own"]:
         own, weights = act(own @ arrays[0] + arrays[1]), arrays[2:]
     things, places = [], {}
-    for name, at in layer["sets"]:
-        things.append(tables[name])
+    for name, at, reader in layer["sets"]:
+        table = tables[name]
+        if at is not None and 0 < layer["near"] < table.shape[-2]:
+            here = 0 if reader is None else x[..., None, reader : reader + 2]
+            order = np.square(table[..., at : at + 2] - here).sum(-1).argsort(-1)[..., : layer["near"], None]
+            table = np.take_along_axis(table, order, -2)
+        things.append(table)
         if at is not None:
-            places[name] = tables[name][..., at : at + 2]
+            places[name] = table[..., at : at + 2]
     parts, squares = [own], [np.square(place).sum(-1) for place in places.values()]
     farthest = 4 * np.concatenate(squares, -1).max(-1, keepdims=True) if squares else 0
-    for k, (table, (name, at)) in enumerate(zip(things, layer["sets"], strict=True)):
+    for k, (table, (name, at, _)) in enumerate(zip(things, layer["sets"], strict=True)):
         first, shared, bias, second, second_bias = weights[5 * k : 5 * k + 5]
         columns = [table] if at is None else [table, np.sqrt(np.square(places[name]).sum(-1, keepdims=True))]
         for other, place in places.items() if at is not None else ():
@@ -165,7 +170,7 @@ def _pool_sets(x: Any, layer: dict[str, Any], arrays: list[Any], tables: Any) ->
         rows = np.concatenate(columns, -1) @ first + (own @ shared + bias)[..., None, :]
         embedded = act(act(rows) @ second + second_bias)
         parts += [embedded.mean(-2), embedded.max(-2)]
-    return np.concatenate(parts, -1)
+    return np.concatenate([*parts, x[..., layer["inputs"] :]], -1)
 
 
 LAYERS = {

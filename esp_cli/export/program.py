@@ -31,7 +31,7 @@ from esp_cli.networks.layers import SeedLayerNorm, SeedLinear, SeedMLP
 from esp_cli.networks.message_passing import REACH_SQUARED, MessagePassing, PictureEncoder
 from esp_cli.networks.plain import GRU, MLP
 from esp_cli.networks.policy import HistoryPolicy, Policy
-from esp_cli.networks.sets import SetNetwork
+from esp_cli.networks.sets import RecurrentSetNetwork, SetNetwork
 from esp_cli.networks.symmetrised import Separate
 from esp_envs.errors import UserError
 
@@ -86,7 +86,7 @@ def program_of(policy: Policy, masked: bool = False) -> Program:
         parts = _plain(actor.parts)
         actor, sums = actor.network, [layers.affine(parts, np.zeros(parts.shape[1], np.float32))]
     previous = policy.head.num_outputs if isinstance(policy, HistoryPolicy) and policy.recurrent else 0
-    own, sets = _sets(actor) if isinstance(actor, SetNetwork) else (_network(actor), {})
+    own, sets = _sets(actor, previous) if isinstance(actor, SetNetwork | RecurrentSetNetwork) else (_network(actor), {})
     if isinstance(head, Categorical | ExploringCategorical | EpsilonGreedy):
         groups: tuple[int, ...] = ()
     elif isinstance(head, BoundedGaussian | BoundedPoint):
@@ -96,7 +96,7 @@ def program_of(policy: Policy, masked: bool = False) -> Program:
     if isinstance(actor, MessagePassing):
         inputs = max(actor.picture.stop, actor.others.stop)
     elif sets:
-        inputs = len(sets["own"])
+        inputs = len(sets["own"]) + previous
     else:
         inputs = next(len(layer.arrays[0]) for layer in own if layer.kind == "affine")
     return Program(
@@ -131,7 +131,7 @@ def _network(actor: Network) -> list[Layer]:
     )
 
 
-def _sets(actor: SetNetwork) -> tuple[list[Layer], dict[str, Any]]:
+def _sets(actor: SetNetwork | RecurrentSetNetwork, previous: int) -> tuple[list[Layer], dict[str, Any]]:
     """Return layers, and where an observation has what they read."""
     encoder, rows = actor.features.encoder, actor.features.encoder.rows
     if rows.places or not rows.own:
@@ -142,7 +142,9 @@ def _sets(actor: SetNetwork) -> tuple[list[Layer], dict[str, Any]]:
     kept = [columns.index(column) for where in rows.own for column in range(where.start, where.stop)]
     own = () if encoder.own is None else _arrays(encoder.own.layers[0])
     sets = []
-    for family, place, embed in zip(rows.families, rows.offsets, encoder.embed.values(), strict=True):
+    for family, place, reader, embed in zip(
+        rows.families, rows.offsets, rows.readers, encoder.embed.values(), strict=True
+    ):
         (first, bias), second = map(_arrays, cast("nn.ModuleList", embed.layers))
         width = len(first) - encoder.num_own
         things = tuple(
@@ -153,10 +155,11 @@ def _sets(actor: SetNetwork) -> tuple[list[Layer], dict[str, Any]]:
             )
             for k in range(family.count)
         )
-        sets.append(SetOf(family.name, things, place, (first[:width], first[width:], bias, *second)))
-    features = pool_sets(sets, own, kept, len(columns), actor.activation)
+        at = None if reader is None else columns.index(reader)
+        sets.append(SetOf(family.name, things, place, at, (first[:width], first[width:], bias, *second)))
+    features = pool_sets(sets, own, kept, len(columns), previous, rows.near, actor.activation)
     found = {"own": tuple(columns), "sets": tuple((each.name, each.columns) for each in sets)}
-    return [features, *_perceptron(actor.head)], found
+    return [features, *(_perceptron(actor.head) if isinstance(actor, SetNetwork) else _network(actor.unit))], found
 
 
 def _message_passing(actor: MessagePassing) -> list[Layer]:

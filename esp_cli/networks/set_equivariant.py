@@ -36,6 +36,8 @@ class SetEquivariantConfig(SetConfig):
         self, generators: Generators, inputs: int, outputs: int, output_gain: float, io: IoSpec | None
     ) -> Network:
         io = sets_or_refuse(self.name, self.io_or_refuse(io))
+        if self.memory:
+            raise UserError("set-equivariant remembers nothing; use set with network.memory")
         if io.num_values is not None:
             return SetNetwork(generators, io, outputs, self, output_gain)
         action = io.spaces.action
@@ -75,8 +77,10 @@ class InvariantRows(Rows):
     With A directions [S, B, .] become [S, B A, .], with each vector's component along one, and whether it is one.
     """
 
-    def __init__(self, layout: Layout, shifts: bool, compiled: bool, points: Sequence[Sequence[float]] = ()) -> None:
-        super().__init__(layout, shifts, compiled)
+    def __init__(
+        self, layout: Layout, shifts: bool, near: int, compiled: bool, points: Sequence[Sequence[float]] = ()
+    ) -> None:
+        super().__init__(layout, shifts, near, compiled)
         self.own_columns = _columns([part.field for part in layout.own if part.where in self.own])
         one = [
             [Field(part.field.name, part.field.kind, 1, parts=part.field.parts) for part in family.parts]
@@ -146,7 +150,7 @@ class DirectionActor(Memoryless):
         action = io.spaces.action
         assert isinstance(action, Discrete)
         compiled = config.compiled is True
-        rows = InvariantRows(io.layout, io.spaces.shifts, compiled, action.points)
+        rows = InvariantRows(io.layout, io.spaces.shifts, config.near, compiled, action.points)
         self.network = SetNetwork(generators, io, 1, config, output_gain, rows)
 
     def forward(self, x: Tensor) -> Tensor:

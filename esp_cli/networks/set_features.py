@@ -32,6 +32,9 @@ class SetShape(CompiledConfig, ABC):
         (64,), min_length=1, max_length=16, description="hidden widths behind the sets"
     )
     width: int = Setting(32, ge=1, le=4096, description="features of each thing of a set")
+    near: int = Setting(
+        0, ge=0, le=4096, description="how many of each set an agent looks at, the nearest ones; 0: all of them"
+    )
 
     @property
     def rows(self) -> type[Rows]:
@@ -41,21 +44,23 @@ class SetShape(CompiledConfig, ABC):
 class Rows:
     """Splits rows into the own numbers and the numbers of the things of each family, in parts that stand side by side.
 
-    Where a task does not change when it is shifted, `places` are taken from the middle of all places of a row. `own`
+    Where a task does not change when it is shifted, `places` are taken from the middle of all places of a row. `near`
+    things of each family are read, the nearest to the reader, to its own place where they are points; 0 for all. `own`
     says where the own numbers lie, of which `num_own` are read; `offsets` for each family the number at which a thing's
-    place begins, and `widths` W.
+    place begins, `readers` where the reader's does, None where it is the origin, and `widths` W.
     """
 
-    def __init__(self, layout: Layout, shifts: bool, compiled: bool) -> None:
+    def __init__(self, layout: Layout, shifts: bool, near: int, compiled: bool) -> None:
         parts = [*layout.own, *(part for family in layout.families for part in family.parts)]
         places = [part.where for part in parts if shifts and part.field.is_point]
         alone = places if sum(where.stop - where.start for where in places) == 2 else []
         self.places = [] if alone else places  # a single one, taken from itself, says nothing
         self.own = [part.where for part in layout.own if part.where not in alone]
         self.num_own = sum(where.stop - where.start for where in self.own)
-        self.layout, self.compiled = layout, compiled
+        self.layout, self.near, self.compiled = layout, near, compiled
         self.families = layout.families
-        self.offsets = [_place_of(family) for family in layout.families]
+        self.offsets = [place_of(family) for family in layout.families]
+        self.readers = [reader_of(layout, family) for family in layout.families]
         located = sum(at is not None for at in self.offsets)
         each = zip(self.families, self.offsets, strict=True)
         self.widths = [family.width + (0 if at is None else 1 + located) for family, at in each]
@@ -69,7 +74,13 @@ class Rows:
         """Return the own numbers [S, B, d] and those of the things of each family [S, B, K, .], undescribed."""
         x = self._from_the_middle(x) if self.places else x
         own = torch.cat([x[..., where] for where in self.own], -1) if self.own else x[..., :0]
-        return own, [_joined(x, family) for family in self.families]
+        things = []
+        for family, at, reader in zip(self.families, self.offsets, self.readers, strict=True):
+            numbers = joined(x, family)
+            if at is not None and 0 < self.near < family.count:
+                numbers = nearest_things(numbers, ways_to(numbers, x, at, reader), self.near)
+            things.append(numbers)
+        return own, things
 
     def distances(self, things: Sequence[Tensor]) -> list[list[Tensor]]:
         """Return for each family the distances of its things, [S, B, K, .], or nothing where they have no place."""
@@ -87,7 +98,7 @@ class Rows:
         return x
 
 
-def _place_of(family: Family) -> int | None:
+def place_of(family: Family) -> int | None:
     """Return the column of a thing's numbers at which its place begins: a point, else its first planar vector."""
     columns, start = [], 0
     for field, _ in family.parts:
@@ -98,10 +109,28 @@ def _place_of(family: Family) -> int | None:
     return min(columns)[1] if columns else None
 
 
-def _joined(x: Tensor, family: Family) -> Tensor:
+def reader_of(layout: Layout, family: Family) -> int | None:
+    """Return the column of the reader's own place, where things are points; None where it is the origin."""
+    own = [part.where.start for part in layout.own if part.field.is_point]
+    points = any(part.is_point for field, _ in family.parts for part in field.parts or (field,))
+    return own[0] if own and points else None
+
+
+def joined(x: Tensor, family: Family) -> Tensor:
     """Return the numbers of a family's things [..., K, W] in rows x [..., D]."""
     parts = [x[..., where].unflatten(-1, (family.count, -1)) for _, where in family.parts]
     return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
+
+
+def ways_to(things: Tensor, x: Tensor, at: int, reader: int | None) -> Tensor:
+    """Return the ways [..., K, 2] from the reader of rows x to things whose places begin at number `at`."""
+    return things[..., at : at + 2] - (0 if reader is None else x[..., None, reader : reader + 2])
+
+
+def nearest_things(things: Tensor, ways: Tensor, count: int) -> Tensor:
+    """Return the things [S, B, K, W] with the shortest ways [S, B, K, 2] to them."""
+    which = ways.square().sum(-1).topk(count, -1, largest=False, sorted=False).indices
+    return things.gather(2, which.unsqueeze(-1).expand(-1, -1, -1, things.shape[-1]))
 
 
 def distances_among(places: Sequence[Tensor]) -> list[Tensor]:
@@ -184,7 +213,7 @@ class TeamFeatures(nn.Module):
         if compiled:
             begin("sets")
         layout = io.layout if io.reads == "state" else spaces.observation
-        rows = rows or config.rows(layout, spaces.shifts, compiled)
+        rows = rows or config.rows(layout, spaces.shifts, 0 if io.reads == "state" else config.near, compiled)
         self.encoder = SetEncoder(generators, rows, config)
         self.num_agents = spaces.num_agents if joint else 0
         found = [f.name for f in layout.families if f.count == spaces.num_agents] if io.reads == "state" else []

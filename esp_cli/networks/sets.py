@@ -14,11 +14,13 @@ from __future__ import annotations
 from typing import Literal
 
 import torch
+from pydantic import Field as Setting
 from torch import Tensor, nn
 
 from esp_cli.networks.contract import Generators, IoSpec, Memoryless, Network
 from esp_cli.networks.joint_q import HYPER_GAIN
 from esp_cli.networks.layers import SeedMLP
+from esp_cli.networks.plain import GRU, GruConfig
 from esp_cli.networks.set_features import Rows, SetShape, TeamFeatures, along
 from esp_envs.errors import UserError
 
@@ -27,11 +29,22 @@ class SetConfig(SetShape):
     """The settings of the network over sets."""
 
     name: Literal["set"] = "set"
+    memory: bool = Setting(
+        False,
+        description="each actor remembers: behind the sets is a gated recurrent unit as wide as the last hidden layer",
+    )
+
+    @property
+    def recurrent(self) -> bool:  # type: ignore[override]
+        """Whether actors carry memory; critics see the whole scene and carry none."""
+        return self.memory
 
     def build(
         self, generators: Generators, inputs: int, outputs: int, output_gain: float, io: IoSpec | None
     ) -> Network:
         io = sets_or_refuse(self.name, self.io_or_refuse(io))
+        if self.memory and io.num_values is None:
+            return RecurrentSetNetwork(generators, io, inputs, outputs, self, output_gain)
         return SetNetwork(generators, io, outputs, self, output_gain)
 
     def joint_critic(self, generators: Generators, io: IoSpec, actions: int, further: int) -> nn.Module | None:
@@ -78,6 +91,30 @@ class SetNetwork(Memoryless):
         if agents is None or not self.values_each:
             return self.head(*parts)
         return self.head(*along(parts, agents), agents).squeeze(-1)
+
+
+class RecurrentSetNetwork(Network):
+    """An agent's sets in, its outputs out, with a memory of their features; the previous action may stand behind."""
+
+    def __init__(
+        self, generators: Generators, io: IoSpec, inputs: int, outputs: int, config: SetConfig, output_gain: float
+    ) -> None:
+        super().__init__()
+        self.activation, self.width = config.activation, io.layout.width
+        self.features = TeamFeatures(generators, io, config)
+        unit = GruConfig(hidden=config.hidden, activation=config.activation, compiled=config.compiled)
+        self.unit = GRU(generators, self.features.width + inputs - self.width, outputs, unit, output_gain)
+        self.memory_width = self.unit.memory_width
+
+    def step(self, x: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        return self.unit.step(self._seen(x), memory)
+
+    def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
+        return self.unit.unroll(self._seen(x.flatten(1, 2)).unflatten(1, x.shape[1:3]), truncation)
+
+    def _seen(self, x: Tensor) -> Tensor:
+        parts, _ = self.features(x[..., : self.width])
+        return torch.cat([*parts, x[..., self.width :]], -1)
 
 
 class SetQ(nn.Module):

@@ -28,8 +28,13 @@ KINDS = {
     "equivariant": ("navigation", "mappo", {"network.name": "equivariant"}),
     "team": ("wildlife", "mappo", {}),
     "sets": ("navigation", "mappo", {"network.name": "set", "task.num_agents": 4}),
-    "sets, values": ("predator-prey", "qmix", {"network.name": "set"}),
-    "sets, tanh": ("predator-prey", "mappo", {"network.name": "set", "network.activation": "tanh"}),
+    "sets, recurrent": (
+        "navigation",
+        "mappo",
+        {"network.name": "set", "network.memory": True, "mappo.num_minibatches": 1},
+    ),
+    "sets, values, recurrent": ("predator-prey", "qmix", {"network.name": "set", "network.memory": True}),
+    "sets, near": ("predator-prey", "mappo", {"network.name": "set", "network.near": 2, "network.activation": "tanh"}),
 }
 """Every head, on a perceptron and on a recurrent network where they differ; every network."""
 LARGE = {"team, values, equivariant": ("wildlife", "qmix", {"network.name": "empn"})}
@@ -42,7 +47,7 @@ REFUSED = {
 
 
 def drawn_policy(
-    kind: str, seeds: tuple[int, ...] = (0,), hidden: tuple[int, ...] = (12, 10), **of_task: object
+    kind: str, seeds: tuple[int, ...] = (0,), hidden: tuple[int, ...] = (12, 10), near: int = 0, **of_task: object
 ) -> TrainedPolicy:
     """Return policies whose weights are large enough to matter: those of a new one give all actions the same chance."""
     task, algorithm, settings = (KINDS | LARGE | REFUSED)[kind]
@@ -50,6 +55,7 @@ def drawn_policy(
         **on_perceptron(task),
         "network.hidden": list(hidden),
         **settings,
+        **({"network.near": near} if near else {}),
         **{f"task.{k}": value for k, value in of_task.items()},
     }
     config = resolve_config(task, algorithm, seeds=seeds, steps=100, overrides=overrides)

@@ -31,25 +31,30 @@ def runners(program: Program, folder: Path) -> dict[str, Runner]:
     return made
 
 
-def test_features_of_things_by_hand(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("near", "expected"),
+    # distances 5 and 1, with sqrt(18) between both; alone, to no other: twice its own distance
+    [(0, [7, (5 + 1) / 2 + 18**0.5, 5 + 18**0.5]), (1, [7, 1 + 2, 1 + 2])],
+)
+def test_features_of_things_by_hand(near: int, expected: list[float], tmp_path: Path) -> None:
     # own number 7; one feature of a thing: the sum of its distance and that to the nearest other
     one, zero = np.ones((1, 1), np.float32), np.zeros(1, np.float32)
     weights = (np.array([[0], [0], [1], [1]], np.float32), 0 * one, zero, one, zero)
-    spots = SetOf("spots", ((1, 2), (3, 4)), place=0, arrays=weights)
-    layer = pool_sets([spots], (), [0], inputs=1, kind="relu")
+    spots = SetOf("spots", ((1, 2), (3, 4)), place=0, reader=None, arrays=weights)
+    layer = pool_sets([spots], (), [0], inputs=1, beside=0, near=near, kind="relu")
     program = Program(1, (layer,), 3, 0, 0, "choose", (), own=(0,), sets=(("spots", spots.columns),))
     own, sets = program.split(np.array([[7, 3, 4, 0, 1], [7, 0, 1, 3, 4]], np.float32))
     assert sets["spots"].tolist() == [[[3, 4], [0, 1]], [[0, 1], [3, 4]]]
-    expected = [7, (5 + 1) / 2 + 18**0.5, 5 + 18**0.5]  # distances 5 and 1, with sqrt(18) between both
     for run in runners(program, tmp_path).values():
         np.testing.assert_allclose(run(own, own[:, :0], None, sets)[1], [expected] * 2, rtol=1e-6)
 
 
-def test_an_export_acts_with_any_number(tmp_path: Path) -> None:
-    trained = drawn_policy("sets")
+@pytest.mark.parametrize("near", [0, 2])
+def test_an_export_acts_with_any_number(near: int, tmp_path: Path) -> None:
+    trained = drawn_policy("sets", near=near)
     files = runners(program_of(trained.policy), tmp_path)
     for count in (2, 9):
-        other = drawn_policy("sets", num_agents=count)
+        other = drawn_policy("sets", near=near, num_agents=count)
         other.policy.load_state_dict(trained.policy.state_dict())
         sample = take_sample(other, program_of(other.policy), 200)
         assert sample.sets["others"].shape == (200, count - 1, 2)

@@ -176,6 +176,34 @@ def test_weights_know_no_count(reads):
     assert {n: p.shape for n, p in few.named_parameters()} == {n: p.shape for n, p in many.named_parameters()}
 
 
+def test_one_looks_at_the_nearest_alone():
+    spec, seen = scene(num_agents=5)
+    near, all_of_them = network(spec, config=SetConfig(near=2)), network(spec)
+    rows = seen.obs.flatten(1, 2)
+    landmarks = rows[..., spec.observation.slices()["landmarks"]].unflatten(-1, (5, 2))
+    farthest = landmarks.norm(dim=-1).argmax(-1)
+    other = rows.clone()
+    where = spec.observation.slices()["landmarks"].start + 2 * farthest
+    for k in (0, 1):
+        other.scatter_(-1, (where + k).unsqueeze(-1), rows.gather(-1, (where + k).unsqueeze(-1)) * 1.5)
+    torch.testing.assert_close(near(rows), near(other), **CLOSE)
+    assert (all_of_them(rows) - all_of_them(other)).abs().amax() > 1e-3
+    torch.testing.assert_close(network(spec, config=SetConfig(near=5))(rows), all_of_them(rows), **CLOSE)
+
+
+@pytest.mark.parametrize("shifts", [False, True])
+def test_the_nearest_of_things_that_are_points_are_nearest_to_the_reader(shifts):
+    """It stands at (5, 0): the wall at (6, 0) is near, that at (1, 0) is far, though it is nearer to the origin."""
+    walls = Field("walls", Kind.VECTOR, 2, family="walls", is_point=True)
+    rows = Rows(layout(Field("place", Kind.VECTOR, is_point=True), walls), shifts, 1, False)
+    x = torch.tensor([5.0, 0.0, 1.0, 0.0, 6.0, 0.0]).view(1, 1, -1)
+    own, (near,) = rows.numbers(x)
+    assert (near - own.unsqueeze(2)).flatten().tolist() == [1.0, 0.0]
+    ways = Field("walls", Kind.VECTOR, 2, family="walls")
+    _, (near,) = Rows(layout(Field("place", Kind.VECTOR, is_point=True), ways), False, 1, False).numbers(x)
+    assert near.flatten().tolist() == [1.0, 0.0], "the control: a way is as long as it is"
+
+
 def test_an_observation_without_like_things_is_refused():
     spec = scene()[0]
     own = layout(*(f for f in spec.observation.fields if not f.family_name))
@@ -186,7 +214,7 @@ def test_an_observation_without_like_things_is_refused():
 
 def test_wide_own_numbers_are_embedded_once():
     spec = make("wildlife", 2, [0]).spec
-    assert Rows(spec.observation, False, False).num_own > 32
+    assert Rows(spec.observation, False, 0, False).num_own > 32
     assert network(spec).features.encoder.num_own == 32
 
 
@@ -282,12 +310,13 @@ def test_qmix_learns_with_a_mixer_over_a_set():
 @pytest.mark.parametrize("reads", ["state", "observations"])
 @pytest.mark.parametrize(
     "network",
-    ["set", "set-equivariant"],
+    [{"name": "set"}, {"name": "set", "memory": True}, {"name": "set-equivariant"}],
+    ids=["set", "memory", "equivariant"],
 )
 def test_mappo_with_compiled_sets_learns_as_by_torch(network, reads):
     def trained(compiled):
         small = {"mappo.num_envs": 4, "mappo.num_epochs": 2, "mappo.num_minibatches": 2, "mappo.critic_input": reads}
-        chosen = {"network.name": network, "network.compiled": compiled}
+        chosen = {f"network.{name}": value for name, value in network.items()} | {"network.compiled": compiled}
         learner = build_learner(resolve_config("navigation", seeds=[0, 1], overrides=chosen | small))
         for _ in range(2):
             assert bool(learner.iterate(0.5).finite.all())
@@ -352,3 +381,34 @@ def test_what_has_no_direction_is_refused_by_the_equivariant_network():
     wheels = make("formation", 1, [0], {"actions": "discrete"}).spec
     with pytest.raises(UserError, match="acts along directions of the plane; use set"):
         network(wheels, config=SetEquivariantConfig())
+
+
+def test_memory_behind_sets_unrolls_as_it_steps_and_knows_no_order():
+    spec, _ = scene()
+    built = build_network(
+        generators((0, 1), "x"),
+        spec.observation.width + 2,
+        5,
+        SetConfig(memory=True, hidden=(8,), width=4),
+        1.0,
+        IoSpec(spec, "own"),
+    )
+    x = torch.randn(2, 3, 4, spec.observation.width + 2, generator=torch.Generator().manual_seed(0))
+    memory, steps = built.initial_memory(2, 3, x), []
+    for t in range(4):
+        y, memory = built.step(x[:, :, t], memory)
+        steps.append(y)
+    whole = built.unroll(x)
+    torch.testing.assert_close(whole, torch.stack(steps, 2), **CLOSE)
+    exchanged, landmarks = x.clone(), spec.observation.slices()["landmarks"]
+    exchanged[:, :, 0, landmarks] = x[:, :, 0, landmarks].unflatten(-1, (-1, 2)).flip(-2).flatten(-2)
+    torch.testing.assert_close(built.unroll(exchanged), whole, **CLOSE)
+    for column in (landmarks.start, -1):  # a landmark of the first step and the last number behind are remembered
+        other = x.clone()
+        other[:, :, 0, column] += 1
+        assert not torch.allclose(built.unroll(other)[:, :, -1], whole[:, :, -1], **CLOSE)
+
+
+def test_the_equivariant_network_over_sets_remembers_nothing():
+    with pytest.raises(UserError, match="set-equivariant remembers nothing; use set"):
+        network(scene()[0], config=SetEquivariantConfig(memory=True))
