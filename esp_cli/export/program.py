@@ -127,7 +127,7 @@ def _network(actor: Network) -> list[Layer]:
         return _message_passing(actor)
     raise UserError(
         f"a network of the kind {type(actor).__name__} cannot be exported; mlp, gru, set, equivariant, mpn and empn "
-        "can, without symmetrise"
+        "can, without symmetrise and order=nearest"
     )
 
 

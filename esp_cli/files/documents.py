@@ -26,17 +26,14 @@ MAX_NESTING = 64
 _LARGEST = 1e30  # of the numbers that a setting takes; float32, in which most of them are used, ends at 3.4e38
 _MAX_INTEGER = 2**63
 _FORCES: dict[str, object] = {"gust_mean": 0.0, "gust_std": 0.0, "weak_agent": 0.0}
-_SORTING: dict[str, object] = {"order": "given"}
 _GONE: dict[str, dict[str, object]] = {
     "navigation": _FORCES,
     "predator-prey": {"prey_policy": None, "prey_policy_seed": 0, "learned_prey": 0.0, **_FORCES},
     "formation": {"penalty_counts": "any", "lame_wheel": 0.0, "heading_offset_rad": 0.0, "blind_sector_rad": 0.0},
-    "mlp": _SORTING,
-    "gru": _SORTING,
     "prior": {"stop_gradient": "none", "terms": "both"},
     "esp-tuning": {"goal": "return", "reach": None},
 }
-"""Settings that earlier versions stored, with their defaults: of a task, a network, the prior, or a document."""
+"""Settings that earlier versions wrote into files, with their defaults: of a task, the prior, or a document."""
 _TOO_DEEP = f"it is nested more than {MAX_NESTING} deep"
 
 

@@ -11,7 +11,7 @@ from typing import Annotated
 
 from pydantic import BeforeValidator, SerializeAsAny
 
-from esp_cli.files.documents import validate, without_gone
+from esp_cli.files.documents import validate
 from esp_cli.networks.contract import ActivationName, Generators, IoSpec, Network, NetworkConfig
 from esp_cli.networks.plain import MlpConfig, PlainConfig
 from esp_cli.networks.symmetrised import LOCAL, LocalFrame, Symmetrised
@@ -48,11 +48,9 @@ def network_class(name: object) -> type[NetworkConfig]:
 
 def _stored(data: object) -> object:
     """Read stored settings by the class of the network that they name; ignore what version 0.1.0 stored in excess."""
-    name = data.get("name", "mlp") if isinstance(data, Mapping) else None
-    data = without_gone(str(name), data)
     if not isinstance(data, Mapping):
         return data
-    cls = network_class(name)
+    cls = network_class(data.get("name", "mlp"))
     excess = _FLAT_FIELDS - set(cls.model_fields)
     kept = {name: value for name, value in data.items() if name not in excess}
     if "compiled" in cls.model_fields:  # a run of before there was a choice computed without kernels

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from esp_cli.networks.contract import ActivationName, Generators, IoSpec, Memoryless, Network, NetworkConfig, WithVJP
 from esp_cli.networks.kernels.library import WORTH_COMPILING, computes, has_compiler
 from esp_cli.networks.layers import GAINS, SeedLayerNorm, SeedLinear, SeedMLP
+from esp_cli.networks.ordering import NearestFirst
 from esp_cli.networks.perceptron import Deferred, Shape, perceptron, perceptron_with_vjp
 from esp_cli.networks.recurrent import SeedGRU
 from esp_envs.errors import UserError
@@ -49,11 +50,15 @@ class PlainConfig(CompiledConfig):
     separate_parts: bool = Field(
         False, description="discrete wheel pairs: one output per speed of each wheel; a pair's output is their sum"
     )
+    order: Literal["given", "nearest"] = Field(
+        "given", description="of like things in an observation; nearest: each set sorted by distance, the nearest first"
+    )
 
     def build(
         self, generators: Generators, inputs: int, outputs: int, output_gain: float, io: IoSpec | None
     ) -> Network:
-        return (GRU if self.recurrent else MLP)(generators, inputs, outputs, self, output_gain)
+        network = (GRU if self.recurrent else MLP)(generators, inputs, outputs, self, output_gain)
+        return network if self.order == "given" else NearestFirst(network, self.io_or_refuse(io), self.products[1])
 
     @property
     def products(self) -> tuple[torch.dtype, bool]:

@@ -17,9 +17,10 @@ from esp_cli.networks.contract import ActivationName, Generators, IoSpec
 from esp_cli.networks.kernels.library import begin, computes
 from esp_cli.networks.kernels.sets import compiled_distances, compiled_pool
 from esp_cli.networks.layers import GAINS, SeedMLP
+from esp_cli.networks.ordering import joined, place_of, reader_of, ways_to
 from esp_cli.networks.plain import CompiledConfig
 from esp_envs.errors import UserError
-from esp_envs.spec import Family, Kind, Layout
+from esp_envs.spec import Layout
 
 
 class SetShape(CompiledConfig, ABC):
@@ -96,35 +97,6 @@ class Rows:
         for where in self.places:
             x[..., where] -= middle.repeat(1, 1, (where.stop - where.start) // 2)
         return x
-
-
-def place_of(family: Family) -> int | None:
-    """Return the column of a thing's numbers at which its place begins: a point, else its first planar vector."""
-    columns, start = [], 0
-    for field, _ in family.parts:
-        for part in field.parts or (field,):
-            if part.kind == Kind.VECTOR:
-                columns.append((not part.is_point, start))
-            start += part.item_width if part is field else part.width
-    return min(columns)[1] if columns else None
-
-
-def reader_of(layout: Layout, family: Family) -> int | None:
-    """Return the column of the reader's own place, where things are points; None where it is the origin."""
-    own = [part.where.start for part in layout.own if part.field.is_point]
-    points = any(part.is_point for field, _ in family.parts for part in field.parts or (field,))
-    return own[0] if own and points else None
-
-
-def joined(x: Tensor, family: Family) -> Tensor:
-    """Return the numbers of a family's things [..., K, W] in rows x [..., D]."""
-    parts = [x[..., where].unflatten(-1, (family.count, -1)) for _, where in family.parts]
-    return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
-
-
-def ways_to(things: Tensor, x: Tensor, at: int, reader: int | None) -> Tensor:
-    """Return the ways [..., K, 2] from the reader of rows x to things whose places begin at number `at`."""
-    return things[..., at : at + 2] - (0 if reader is None else x[..., None, reader : reader + 2])
 
 
 def nearest_things(things: Tensor, ways: Tensor, count: int) -> Tensor:

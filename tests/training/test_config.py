@@ -112,7 +112,6 @@ GONE = [
     ("task_settings", {"prey_policy": None, "prey_policy_seed": 0, "learned_prey": 0.0}, {"learned_prey": 0.5}),
     ("task_settings", {"gust_mean": 0.0, "gust_std": 0.0, "weak_agent": 0.0}, {"weak_agent": 0.5}),
     ("prior", {"stop_gradient": "none", "terms": "both"}, {"stop_gradient": "original", "terms": "value"}),
-    ("network", {"order": "given"}, {"order": "nearest"}),
 ]
 """By part of a configuration, settings that went: as earlier versions stored them, and one that they acted on."""
 

@@ -8,6 +8,13 @@ namespace {
 
 constexpr int64_t ROWS = 64;  // of a task
 
+template <class Work>
+void each_rows(int64_t rows, int64_t threads, int64_t room, Work work) {
+    const Shares shares(1, rows, ROWS, threads);
+    share_out(
+        shares, 0, room, [](int64_t) {}, [&](int64_t task, float *own) { work(shares.of(task), own); }, [](int64_t) {});
+}
+
 Vec root(Vec x) {
     for (int i = 0; i < LANES; i++) x[i] = std::sqrt(x[i]);
     return x;
@@ -22,9 +29,7 @@ extern "C" {
 void distances(const int64_t *shape, const int64_t *sizes, const float *places, float *to) {
     const int64_t rows = shape[0], things = shape[1], families = shape[2], columns = families + 1;
     // LANES rows at a time, a vector for each coordinate of each thing
-    const Shares shares(1, rows, ROWS, shape[3]);
-    auto work = [&](int64_t task, float *own) {
-        const Span span = shares.of(task);
+    each_rows(rows, shape[3], 2 * things * LANES, [&](Span span, float *own) {
         for (int64_t begin = span.begin; begin < span.end; begin += LANES) {
             int64_t count = std::min<int64_t>(LANES, span.end - begin);
             for (int64_t k = 0; k < 2 * things; k++)
@@ -53,8 +58,35 @@ void distances(const int64_t *shape, const int64_t *sizes, const float *places, 
                 }
             }
         }
-    };
-    share_out(shares, 0, 2 * things * LANES, [](int64_t) {}, work, [](int64_t) {});
+    });
+}
+
+// Sort the things of rows [rows, row] by the distance of their places, which begin at number `at` of a thing, from that
+// at column `reader`, or from the origin where it is negative. columns: [things, width], where a thing's numbers are.
+void sort(const int64_t *shape, const int64_t *columns, float *rows) {
+    const int64_t row = shape[1], things = shape[2], width = shape[3], at = shape[4], reader = shape[5];
+    each_rows(shape[0], shape[6], things * (width + 2), [&](Span span, float *own) {
+        float *moved = own + things;                // [things, width]
+        float *order = moved + things * width;      // small whole numbers
+        for (int64_t r = span.begin; r < span.end; r++) {
+            float *x = rows + r * row, here[] = {reader < 0 ? 0 : x[reader], reader < 0 ? 0 : x[reader + 1]};
+            for (int64_t k = 0; k < things; k++) {
+                float a = x[columns[k * width + at]] - here[0], b = x[columns[k * width + at + 1]] - here[1];
+                float square = a * a + b * b;
+                int64_t place = k;
+                for (; place > 0 && own[place - 1] > square; place--) {
+                    own[place] = own[place - 1];
+                    order[place] = order[place - 1];
+                }
+                own[place] = square;
+                order[place] = k;
+            }
+            for (int64_t k = 0; k < things * width; k++) moved[k] = x[columns[k]];
+            for (int64_t k = 0; k < things; k++)
+                for (int64_t c = 0; c < width; c++)
+                    x[columns[k * width + c]] = moved[static_cast<int64_t>(order[k]) * width + c];
+        }
+    });
 }
 
 // Pass the things of sets, [S, R K, in], through a perceptron that ends with an activation, and write mean and maximum

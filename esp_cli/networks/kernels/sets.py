@@ -12,15 +12,33 @@ from esp_cli.networks.kernels.library import call
 from esp_cli.networks.kernels.perceptron import Below, CompiledPass, RowsAt
 
 
+def _shape(*sizes: int) -> ctypes.Array[ctypes.c_int64]:
+    return (ctypes.c_int64 * len(sizes))(*sizes)
+
+
 def compiled_distances(places: Sequence[Tensor]) -> list[Tensor]:
     """Return what `sets.distances_among` does, of places [S, B, K, 2] on the CPU."""
     sizes = [place.shape[2] for place in places]
     joined = torch.cat([*places], 2).contiguous()
     found = joined.new_empty(*joined.shape[:3], 1 + len(places))
-    rows, things = found.shape[0] * found.shape[1], found.shape[2]
-    shape = (ctypes.c_int64 * 4)(rows, things, len(places), torch.get_num_threads())
-    call("sets", "distances", shape, (ctypes.c_int64 * len(sizes))(*sizes), joined, found)
+    shape = _shape(found.shape[0] * found.shape[1], found.shape[2], len(places), torch.get_num_threads())
+    call("sets", "distances", shape, _shape(*sizes), joined, found)
     return list(found.split(sizes, 2))
+
+
+def sort_things(rows: Tensor, columns: Tensor, at: int, reader: int | None) -> None:
+    """Sort the things of a set in contiguous rows [B, D] on the CPU, in place, by distance from the column `reader`.
+
+    Each thing's numbers are in `columns` [K, W], and its place begins with the number `at`. None stands for the origin.
+    """
+    own = -1 if reader is None else reader
+    call(
+        "sets",
+        "sort",
+        _shape(*rows.shape, *columns.shape, at, own, torch.get_num_threads()),
+        columns.contiguous(),
+        rows,
+    )
 
 
 class _PooledPass(CompiledPass):
