@@ -22,23 +22,33 @@ class SeedParameters:
         self.parameters = list(parameters)
         ends = torch.tensor([p[0].numel() for p in self.parameters]).cumsum(0).tolist()
         self._parts = list(pairwise([0, *ends]))
-        self._begins = {id(p): begin for p, (begin, _) in zip(self.parameters, self._parts, strict=True)}
+        self._places = {id(p): k for k, p in enumerate(self.parameters)}
         first = self.parameters[0]
-        rest = first.new_zeros(first.shape[0], -ends[-1] % _ALIGNED)
-        self.buffer = torch.cat([*(p.detach().flatten(1) for p in self.parameters), rest], 1)
+        self._rest = first.new_zeros(first.shape[0], -ends[-1] % _ALIGNED)
+        self.buffer = self.flat([p.detach() for p in self.parameters])
         for parameter, view in zip(self.parameters, self.views(self.buffer), strict=True):
             parameter.data = view
+
+    def flat(self, tensors: Sequence[Tensor]) -> Tensor:
+        """Return a new buffer [S, P] of tensors [S, ...] in the order of the parameters."""
+        return torch.cat([*(tensor.flatten(1) for tensor in tensors), self._rest], 1)
 
     def sum(self, gradients: Sequence[tuple[Sequence[Tensor], Sequence[Tensor]]]) -> Tensor:
         """Return a new buffer [S, P] of the sum of gradients by some of the parameters.
 
         These follow each other here, with the gradients by each of them, or one by all side by side.
         """
-        total = torch.zeros_like(self.buffer)
-        for parameters, by_parameters in gradients:
-            begin, found = self._begins[id(parameters[0])], torch.cat([by.flatten(1) for by in by_parameters], 1)
-            total[:, begin : begin + found.shape[1]] += found
-        return total
+        parts, rest = [], []
+        at = 0
+        for parameters, by_parameters in sorted(gradients, key=lambda pair: self._places[id(pair[0][0])]):
+            first = self._places[id(parameters[0])]
+            if first < at:
+                rest.append((parameters, by_parameters))
+                continue
+            parts += [torch.zeros_like(p) for p in self.parameters[at:first]] + [*by_parameters]
+            at = first + len(parameters)
+        total = self.flat([*parts, *(torch.zeros_like(p) for p in self.parameters[at:])])
+        return total.add_(self.sum(rest)) if rest else total
 
     def views(self, buffer: Tensor) -> list[Tensor]:
         """Return the part of a buffer [S, P] that belongs to each parameter, in its shape."""
