@@ -114,29 +114,22 @@ class SeedAdam:
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return the moments of every parameter under its number; nothing before the first step."""
-        if not self.count:
-            return {}
-        moments = zip(self.parameters.views(self.mean), self.parameters.views(self.square), strict=True)
-        out: dict[str, Tensor] = {}
-        for index, (mean, square) in enumerate(moments):
-            out |= {f"{index}.step": self.count, f"{index}.exp_avg": mean, f"{index}.exp_avg_sq": square}
-        return out
+        return self._moments() if self.count else {}
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
-        shapes = {f"{k}.step": self.count.shape for k in range(len(self.parameters.parameters))}
-        for k, parameter in enumerate(self.parameters.parameters):
-            shapes |= {f"{k}.exp_avg": parameter.shape, f"{k}.exp_avg_sq": parameter.shape}
-        for name in {*shapes, *tensors} if tensors else ():
-            if name not in shapes or name not in tensors or tensors[name].shape != shapes[name]:
+        own = self._moments()
+        for name in own.keys() | tensors.keys() if tensors else ():
+            if name not in own or name not in tensors or tensors[name].shape != own[name].shape:
                 raise KeyError(f"the moments of parameter {name.partition('.')[0]}")
-        for state in (self.mean, self.square, self.count):
-            state.zero_()
-        for name, tensor in tensors.items():
-            index, _, key = name.partition(".")
-            if key == "step":
-                self.count.copy_(tensor)
-            else:
-                self.parameters.views(self.mean if key == "exp_avg" else self.square)[int(index)].copy_(tensor)
+        for name, moment in own.items():
+            moment.copy_(tensors.get(name, torch.zeros_like(moment)))
+
+    def _moments(self) -> dict[str, Tensor]:
+        out: dict[str, Tensor] = {}
+        moments = zip(self.parameters.views(self.mean), self.parameters.views(self.square), strict=True)
+        for k, (mean, square) in enumerate(moments):
+            out |= {f"{k}.step": self.count, f"{k}.exp_avg": mean, f"{k}.exp_avg_sq": square}
+        return out
 
 
 def clip_per_seed(groups: Sequence[Tensor], max_norm: float) -> list[Tensor]:

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from esp_cli.algorithms.adam import SeedAdam
 from esp_cli.files.documents import Strict
-from esp_cli.networks.contract import NetworkConfig
+from esp_cli.networks.contract import Generators, NetworkConfig
 from esp_cli.networks.policy import Policy
 from esp_cli.prior import PriorConfig, SymmetryPrior
 from esp_envs.base import Environment, generator_states, restore_generators
@@ -40,16 +40,18 @@ class LearnerConfig(Strict):
         return frozenset()
 
 
-class Worlds(Protocol):
+class Worlds:
     """Acts in the training worlds and remembers where each stands."""
 
-    env: Environment
+    def __init__(self, env: Environment, policy: Any, generators: Generators) -> None:
+        self.env, self.policy, self.generators = env, policy, generators
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return what a resumed run needs to go on bit for bit."""
+        """Return what a resumed run needs to go on bit for bit: between episodes that is the worlds' own state."""
+        return under("env", self.env.state_dict())
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
-        """Restore what `state_dict` returned."""
+        self.env.load_state_dict(below(tensors, "env"))
 
 
 class Learner(ABC):
@@ -96,8 +98,8 @@ class Learner(ABC):
         config: Any,
         network: NetworkConfig,
         prior: PriorConfig,
-        generators: Sequence[torch.Generator],
-        prior_generators: Sequence[torch.Generator],
+        generators: Generators,
+        prior_generators: Generators,
     ) -> None:
         self.config, self.spec, self.device = config, env.spec, env.device
         self.prior = SymmetryPrior(prior, env.spec, env.device, self.replays)
@@ -114,7 +116,7 @@ class Learner(ABC):
 
     @classmethod
     @abstractmethod
-    def build_policy(cls, spec: TaskSpec, network: NetworkConfig, generators: Sequence[torch.Generator]) -> Policy:
+    def build_policy(cls, spec: TaskSpec, network: NetworkConfig, generators: Generators) -> Policy:
         """Return new policies of the kind that this algorithm trains, one per generator."""
 
     @property
@@ -147,15 +149,15 @@ class Learner(ABC):
 
     def state_dict(self, complete: bool = False) -> dict[str, Tensor]:
         """Return flat tensors that a resumed run needs; once `complete`, less what only further learning needs."""
-        out: dict[str, Tensor] = {}
-        for name, module in self.modules.items():
-            out |= {f"{name}.{key}": value for key, value in module.state_dict().items()}
-        for name, optimiser in self.optimisers.items():
-            out |= {f"optimiser.{name}.{key}": value for key, value in optimiser.state_dict().items()}
-        for name, generators in self.generators.items():
-            out[f"generators.{name}"] = generator_states(generators)
-        out |= {f"prior.{key}": value for key, value in self.prior.state_dict().items()}
-        return out | {f"collector.{key}": value for key, value in self.collector.state_dict().items()}
+        out = {f"generators.{name}": generator_states(generators) for name, generators in self.generators.items()}
+        for name, part in self._parts().items():
+            out |= under(name, part.state_dict())
+        return out
+
+    def _parts(self) -> dict[str, Any]:
+        """Return all that has tensors of its own, by the name before theirs."""
+        optimisers = {f"optimiser.{name}": optimiser for name, optimiser in self.optimisers.items()}
+        return {**self.modules, **optimisers, "prior": self.prior, "collector": self.collector}
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
         """Restore what `state_dict` returned.
@@ -164,25 +166,18 @@ class Learner(ABC):
             UserError: tensors of another shape or name, so of another configuration.
         """
         try:
-            for name, module in self.modules.items():
-                module.load_state_dict(below(tensors, name))
-            for name, optimiser in self.optimisers.items():
-                optimiser.load_state_dict(below(tensors, f"optimiser.{name}"))
+            for name, part in self._parts().items():
+                part.load_state_dict(below(tensors, name))
             for name, generators in self.generators.items():
                 restore_generators(generators, tensors[f"generators.{name}"])
-            self.prior.load_state_dict(below(tensors, "prior"))
-            self.collector.load_state_dict(below(tensors, "collector"))
         except (KeyError, RuntimeError, IndexError, TypeError, ValueError) as error:
             reason = str(error).split("\n")[0]
             raise UserError(f"the checkpoint does not fit this configuration ({reason})") from None
 
     def further_weights(self) -> dict[str, dict[str, Tensor]]:
         """Return the tensors of every module beside the policy, as `state_dict` names them, by the module's name."""
-        others = {name: module for name, module in self.modules.items() if name not in ("policy", "target_policy")}
-        return {
-            name: {f"{name}.{key}": tensor for key, tensor in module.state_dict().items()}
-            for name, module in others.items()
-        }
+        others = self.modules.keys() - {"policy", "target_policy"}
+        return {name: under(name, module.state_dict()) for name, module in self.modules.items() if name in others}
 
     def start_from(self, weights: Mapping[str, Tensor]) -> None:
         """Give these weights to the policy and its target, and to the modules whose names they bear."""
@@ -204,6 +199,11 @@ class Learner(ABC):
         """Return every tensor with a leading seed axis that learning changes: weights, statistics, moments."""
         out = [tensor for module in self.modules.values() for tensor in module.state_dict().values()]
         return out + [moment for adam in self.optimisers.values() for moment in (adam.mean, adam.square)]
+
+
+def under(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors as entries under `prefix.`."""
+    return {f"{prefix}.{name}": tensor for name, tensor in tensors.items()}
 
 
 def below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

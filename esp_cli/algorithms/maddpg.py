@@ -7,7 +7,7 @@ actions, and the actor follows its gradient. Supplement eq. 19 is added to the c
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Literal
 
 import torch
@@ -19,8 +19,9 @@ from esp_cli.algorithms.objectives import value_loss
 from esp_cli.algorithms.off_policy import ExploringConfig, ExploringLearner
 from esp_cli.algorithms.replay import EpisodeBatch
 from esp_cli.networks.build import perceptron
-from esp_cli.networks.contract import IoSpec, NetworkConfig
+from esp_cli.networks.contract import Generators, IoSpec, NetworkConfig
 from esp_cli.networks.exploration import ActorHead, ExploringCategorical, build_actor_head
+from esp_cli.networks.heads import drawn
 from esp_cli.networks.joint_q import PerAgentCriticInput
 from esp_cli.networks.plain import MLP
 from esp_cli.networks.policy import POLICY_GAIN, HistoryPolicy
@@ -80,26 +81,18 @@ class Maddpg(ExploringLearner):
         self.actor_optimiser = self.adam(self.policy, learning_rate=config.actor_learning_rate)
         self.critic_optimiser = self.adam(self.critic, learning_rate=config.learning_rate)
         self._targets_of = [
-            (SeedParameters(list(target.parameters())), optimiser.parameters)
-            for target, optimiser in (
-                (self.target_policy, self.actor_optimiser),
-                (self.target_critic, self.critic_optimiser),
-            )
+            (SeedParameters([*self.target_policy.parameters()]), self.actor_optimiser.parameters),
+            (SeedParameters([*self.target_critic.parameters()]), self.critic_optimiser.parameters),
         ]
-        self.modules |= {
-            "critic": self.critic,
-            "target_policy": self.target_policy,
-            "target_critic": self.target_critic,
-        }
+        targets = {"target_policy": self.target_policy, "target_critic": self.target_critic}
+        self.modules |= {"critic": self.critic, **targets}
         self.optimisers = {"actor": self.actor_optimiser, "critic": self.critic_optimiser}
         # In units of one step's standardised reward: divided by the root of the horizon, its gradient would be so small
         # that Adam's epsilon slows the actor down.
         self._value_scale = spec.horizon**0.5
 
     @classmethod
-    def build_policy(
-        cls, spec: TaskSpec, network: NetworkConfig, generators: Sequence[torch.Generator]
-    ) -> HistoryPolicy:
+    def build_policy(cls, spec: TaskSpec, network: NetworkConfig, generators: Generators) -> HistoryPolicy:
         return HistoryPolicy(spec, network, generators, build_actor_head(spec.action, len(generators)), POLICY_GAIN)
 
     def update(self, batch: EpisodeBatch) -> dict[str, Tensor]:
@@ -135,8 +128,7 @@ class Maddpg(ExploringLearner):
         """Take one gradient step down -Q(s, pi(o)) + penalty + c S_pi; `here` is what the critic sees of every row."""
         rows, batch = copies.originals, copies.loss_rows
         lead = (rows.count, self.spec.horizon, self.spec.num_agents, self.head.num_outputs)
-        noise = torch.stack([torch.rand(lead, generator=g) for g in self.generators["learner"]])
-        noise = copies.tiled(noise.to(self.device, non_blocking=True))
+        noise = copies.tiled(drawn(torch.rand, lead, self.generators["learner"]).to(self.device, non_blocking=True))
         outputs = self._outputs(copies.rows)
         chosen = copies.for_loss(outputs)
         for p in self.critic_optimiser.parameters.parameters:  # a module looks for them each time

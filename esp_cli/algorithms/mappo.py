@@ -7,7 +7,7 @@ Eq. 4, the consistency terms of Eq. 8 and 9, combined as in Eq. 10.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal
 
@@ -29,7 +29,7 @@ from esp_cli.algorithms.objectives import (
     value_loss,
 )
 from esp_cli.algorithms.rollout import Batch, Collector, Rollout, values_along
-from esp_cli.networks.contract import NetworkConfig, Reads
+from esp_cli.networks.contract import Generators, NetworkConfig, Reads
 from esp_cli.networks.policy import Critic, StochasticPolicy
 from esp_cli.prior import Answers, Copies, Loss, mean_per_seed
 from esp_envs.base import Environment
@@ -126,9 +126,7 @@ class Mappo(Learner):
         self._old: tuple[StochasticPolicy, Critic] | None = None
 
     @classmethod
-    def build_policy(
-        cls, spec: TaskSpec, network: NetworkConfig, generators: Sequence[torch.Generator]
-    ) -> StochasticPolicy:
+    def build_policy(cls, spec: TaskSpec, network: NetworkConfig, generators: Generators) -> StochasticPolicy:
         return StochasticPolicy(spec, network, generators)
 
     @property

@@ -108,7 +108,6 @@ def explained_variance(value: Tensor, target: Tensor, valid: Tensor | None = Non
 
 
 def _variance(x: Tensor, valid: Tensor | None) -> Tensor:
-    """Return the variance [S] of each seed over what counts."""
     return x.flatten(1).var(1, correction=0) if valid is None else mean_per_seed(_centred(x, valid).square(), valid)
 
 

@@ -10,7 +10,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from esp_cli.algorithms.adam import SeedAdam
-from esp_cli.algorithms.learner import Iteration, Learner, LearnerConfig, below
+from esp_cli.algorithms.learner import Iteration, Learner, LearnerConfig, below, under
 from esp_cli.algorithms.normalisation import ValueNormaliser
 from esp_cli.algorithms.objectives import td_targets, value_error
 from esp_cli.algorithms.replay import EpisodeBatch, EpisodeCollector, EpisodeReplay
@@ -200,8 +200,7 @@ class OffPolicyLearner(Learner):
 
     def state_dict(self, complete: bool = False) -> dict[str, Tensor]:
         out = super().state_dict(complete) | {"counters": torch.tensor([self.episodes, self.updates])}
-        replay = {} if complete else self.replay.state_dict()
-        return out | {f"replay.{name}": tensor for name, tensor in replay.items()}
+        return out if complete else out | under("replay", self.replay.state_dict())
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
         super().load_state_dict(tensors)

@@ -40,6 +40,7 @@ _PAPER_OFF_POLICY = {**_ONE_EPISODE, **_PLAIN_LEARNING, "critic_sees_time": Fals
 # "paper" is supplement table 2 (MAPPO) or 3 (MADDPG, QMIX), and the MAPPO paper's defaults where these are silent.
 _PAPER_MAPPO = {"num_envs": 128, "num_minibatches": 1, **_PLAIN_LEARNING, "anneal_entropy": False, "clip_value": True}
 _PAPER_ACTOR = {"actor_learning_rate": 7e-4, "actor_actions": "own", "output_penalty": 0.0}
+_PAPER_COPIES: Sections = {"network": _GRU, "prior": {**_QUARTER_TURN, "replay": "stored"}}
 PRESETS: dict[str, dict[str, Sections]] = {
     "mappo": {
         "default": {},
@@ -47,19 +48,11 @@ PRESETS: dict[str, dict[str, Sections]] = {
     },
     "maddpg": {
         "default": {"network": {"activation": "relu"}},
-        "paper": {
-            "maddpg": {**_PAPER_OFF_POLICY, **_PAPER_ACTOR},
-            "network": _GRU,
-            "prior": {**_QUARTER_TURN, "replay": "stored"},
-        },
+        "paper": {"maddpg": {**_PAPER_OFF_POLICY, **_PAPER_ACTOR}, **_PAPER_COPIES},
     },
     "qmix": {
         "default": {"network": {"activation": "relu"}},
-        "paper": {
-            "qmix": {**_PAPER_OFF_POLICY, "critic_input": "state"},
-            "network": _GRU,
-            "prior": {**_QUARTER_TURN, "replay": "stored"},
-        },
+        "paper": {"qmix": {**_PAPER_OFF_POLICY, "critic_input": "state"}, **_PAPER_COPIES},
     },
 }
 

@@ -10,7 +10,7 @@ An agent that has ended adds nothing: its value enters the mixer as 0. (PyMARL f
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from types import MappingProxyType
 
 import torch
@@ -21,7 +21,7 @@ from esp_cli.algorithms.objectives import value_loss
 from esp_cli.algorithms.off_policy import ExploringConfig, ExploringLearner
 from esp_cli.algorithms.replay import EpisodeBatch
 from esp_cli.networks.build import perceptron
-from esp_cli.networks.contract import IoSpec, NetworkConfig
+from esp_cli.networks.contract import Generators, IoSpec, NetworkConfig
 from esp_cli.networks.exploration import EpsilonGreedy
 from esp_cli.networks.heads import best
 from esp_cli.networks.joint_q import MonotonicMixer
@@ -75,9 +75,7 @@ class Qmix(ExploringLearner):
         self.optimisers = {"adam": self.optimiser}
 
     @classmethod
-    def build_policy(
-        cls, spec: TaskSpec, network: NetworkConfig, generators: Sequence[torch.Generator]
-    ) -> HistoryPolicy:
+    def build_policy(cls, spec: TaskSpec, network: NetworkConfig, generators: Generators) -> HistoryPolicy:
         if not isinstance(spec.action, Discrete):
             raise UserError(
                 f"qmix chooses among discrete actions, but those of this {spec.name} are continuous; "

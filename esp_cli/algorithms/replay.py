@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from esp_cli.algorithms.learner import below
+from esp_cli.algorithms.learner import Worlds
 from esp_cli.algorithms.rollout import stacked
-from esp_cli.networks.policy import HistoryPolicy
 from esp_cli.prior import SeedBatch
-from esp_envs.base import Environment
 from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, TaskSpec
 
@@ -87,8 +84,6 @@ class EpisodeReplay:
     def add(self, episodes: EpisodeBatch) -> None:
         """Store episodes; the oldest give way."""
         count = episodes.obs.shape[1]
-        if count > self.capacity:
-            raise UserError(f"{count} episodes at once do not fit into a replay of {self.capacity}; enlarge it")
         places = (self.cursor + torch.arange(count, device=episodes.obs.device)) % self.capacity
         for name, tensor in self._store.tensors.items():
             tensor.index_copy_(1, places, getattr(episodes, name).to(tensor.dtype))
@@ -123,11 +118,8 @@ class EpisodeReplay:
         self.size, self.cursor = size, int(tensors["cursor"]) % self.capacity
 
 
-class EpisodeCollector:
+class EpisodeCollector(Worlds):
     """Plays one episode in every world at a time, each from a fresh start."""
-
-    def __init__(self, env: Environment, policy: HistoryPolicy, generators: Sequence[torch.Generator]) -> None:
-        self.env, self.policy, self.generators = env, policy, generators
 
     @torch.no_grad()
     def collect(self) -> tuple[EpisodeBatch, Tensor]:
@@ -138,8 +130,7 @@ class EpisodeCollector:
         observation = env.reset()
         memory = policy.initial_memory(env.num_envs, observation.obs)
         running = torch.ones(env.num_seeds, env.num_envs, dtype=torch.bool, device=env.device)
-        seen = [observation]
-        actions, rewards, terminated, valid = [], [], [], []
+        seen, actions, taken, valid = [observation], [], [], []
         for t in range(steps):
             outputs, memory = policy.step(observation.obs, memory, observation.action_mask)
             action = head.sample(outputs, noise[:, t])
@@ -148,11 +139,10 @@ class EpisodeCollector:
             observation = step.next
             seen.append(step.reached)
             actions.append(action)
-            rewards.append(step.reward)
-            terminated.append(step.terminated)
+            taken.append(step)
             valid.append(running)
             running = running & ~step.ended
-        reward, mask = torch.stack(rewards, 2), torch.stack(valid, 2)
+        reward, mask = torch.stack([step.reward for step in taken], 2), torch.stack(valid, 2)
         returns = torch.where(mask, reward.mean(-1), 0.0).sum(2).mean(1)
         shared = reward[..., :1] if env.spec.shared_reward else reward
         batch = EpisodeBatch(
@@ -160,16 +150,9 @@ class EpisodeCollector:
             torch.stack([x.state for x in seen], 2),
             torch.stack(actions, 2),
             shared,
-            torch.stack(terminated, 2),
+            torch.stack([step.terminated for step in taken], 2),
             mask,
             action_mask=stacked([x.action_mask for x in seen]),
             alive=stacked([x.alive for x in seen]),
         )
         return batch, returns
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return what a resumed run needs: between episodes that is the worlds' own state."""
-        return {f"env.{name}": tensor for name, tensor in self.env.state_dict().items()}
-
-    def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
-        self.env.load_state_dict(below(tensors, "env"))

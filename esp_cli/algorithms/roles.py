@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from esp_cli.algorithms.learner import Iteration, Learner
-from esp_cli.networks.contract import NetworkConfig
+from esp_cli.networks.contract import Generators, NetworkConfig
 from esp_cli.networks.policy import Policy
 from esp_cli.networks.roles import RolesPolicy
 from esp_cli.prior import PriorConfig
@@ -20,8 +20,6 @@ from esp_envs.base import Environment
 from esp_envs.roles import without_agents
 from esp_envs.spec import TaskSpec
 from esp_envs.views import Lockstep, RoleView
-
-Generators = Sequence[torch.Generator]
 
 
 def new_policy(cls: type[Learner], spec: TaskSpec, network: NetworkConfig, generators: Generators) -> Policy:

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from esp_cli.algorithms.learner import below
+from esp_cli.algorithms.learner import Worlds
+from esp_cli.networks.contract import Generators
 from esp_cli.networks.policy import Critic, StochasticPolicy
 from esp_cli.prior import SeedBatch
 from esp_envs.base import Environment, Observation
@@ -50,17 +51,16 @@ class Batch(SeedBatch):
     value: Tensor
 
 
-class Collector:
+class Collector(Worlds):
     """Acts in the worlds and remembers, between rollouts, where each stands."""
 
-    def __init__(self, env: Environment, policy: StochasticPolicy, generators: Sequence[torch.Generator]) -> None:
-        self.env, self.policy, self.generators = env, policy, generators
+    def __init__(self, env: Environment, policy: StochasticPolicy, generators: Generators) -> None:
+        super().__init__(env, policy, generators)
         self._begin()
         self.finished_return = torch.zeros(env.num_seeds, device=env.device)
         self.finished_count = torch.zeros(env.num_seeds, device=env.device)
 
     def _begin(self) -> None:
-        """Start a new episode in every world."""
         env = self.env
         self.observation, self._stale = env.reset(), False
         self.memory = self.policy.initial_memory(env.num_envs, self.observation.obs)
@@ -71,38 +71,34 @@ class Collector:
         """Act for `num_steps` steps in every world with actions drawn from the policy."""
         if self._stale:
             self._begin()
-        spec, device = self.env.spec, self.env.device
-        lead = (self.env.num_seeds, self.env.num_envs, num_steps)
-        noise = self.policy.head.noise((num_steps, self.env.num_envs, spec.num_agents), self.generators)
-        noise = noise.to(device, non_blocking=True)
-        obs = torch.empty(*lead, spec.num_agents, spec.observation.width, device=device)
-        state = torch.empty(*lead, spec.state.width, device=device)
-        outputs, actions, masks, alive, gone, finals = [], [], [], [], [], {}
-        rewards, terminated, over = [], [], []
+        noise = self.policy.head.noise((num_steps, self.env.num_envs, self.env.spec.num_agents), self.generators)
+        noise = noise.to(self.env.device, non_blocking=True)
+        seen, outputs, actions, steps = [], [], [], []
         for t in range(num_steps):
-            obs[:, :, t], state[:, :, t] = self.observation.obs, self.observation.state
+            seen.append(self.observation)
             output, self.memory = self.policy.step(self.observation.obs, self.memory, self.observation.action_mask)
-            masks.append(self.observation.action_mask)
-            alive.append(self.observation.alive)
             action = self.policy.head.sample(output, noise[:, t])
             step = self.env.step(self.policy.head.to_environment(action))
             outputs.append(output)
             actions.append(action)
-            ended = step.ended
-            rewards.append(step.reward)
-            terminated.append(step.terminated)
-            over.append(ended)
-            if step.final is not None:
-                finals[t] = step.final
-            after = step.reached.alive
-            gone.append(None if after is None else ~after)
-            self._finish(step.reward, ended, step.final is not None)
+            steps.append(step)
+            self._finish(step.reward, step.ended, step.final is not None)
             self.observation = step.next
-        action_rows = torch.stack(actions, 2)
-        log_prob = self.policy.head.log_prob(torch.stack(outputs, 2), action_rows)
-        flags = (stacked(flags) for flags in (masks, alive, gone))
-        done = (torch.stack(rewards, 2), torch.stack(terminated, 2), torch.stack(over, 2))
-        return Rollout(obs, state, action_rows, log_prob, *done, self.observation, finals, *flags)
+        action_rows, after = torch.stack(actions, 2), [step.reached.alive for step in steps]
+        return Rollout(
+            torch.stack([x.obs for x in seen], 2),
+            torch.stack([x.state for x in seen], 2),
+            action_rows,
+            self.policy.head.log_prob(torch.stack(outputs, 2), action_rows),
+            torch.stack([step.reward for step in steps], 2),
+            torch.stack([step.terminated for step in steps], 2),
+            torch.stack([step.ended for step in steps], 2),
+            self.observation,
+            {t: step.final for t, step in enumerate(steps) if step.final is not None},
+            stacked([x.action_mask for x in seen]),
+            stacked([x.alive for x in seen]),
+            stacked([None if alive is None else ~alive for alive in after]),
+        )
 
     def _finish(self, reward: Tensor, ended: Tensor, any_ended: bool) -> None:
         """Add up returns (mean over agents of the sum over time) and empty the memory of ended episodes."""
@@ -124,7 +120,7 @@ class Collector:
 
     def state_dict(self) -> dict[str, Tensor]:
         """Return what a resumed run needs: of worlds that cannot go on in mid-episode their generators alone."""
-        worlds = {f"env.{name}": tensor for name, tensor in self.env.state_dict().items()}
+        worlds = super().state_dict()
         if not self.env.has("state_dict"):
             return worlds
         seen = {name: getattr(self.observation, name) for name in ("obs", "state", "action_mask", "alive")}
@@ -133,7 +129,7 @@ class Collector:
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
         if not self.env.has("state_dict"):
-            self.env.load_state_dict(below(tensors, "env"))
+            super().load_state_dict(tensors)
             self._stale = True  # the next rollout begins new episodes
             return
         own = {name: tensors[name].to(self.env.device) for name in ("obs", "state", "memory", "episode_return")}
@@ -143,7 +139,7 @@ class Collector:
         alive = tensors["alive"].to(self.env.device) if self.env.spec.agents_end else None
         self.observation = Observation(own["obs"], own["state"], mask, alive)
         self.memory, self.episode_return = own["memory"], own["episode_return"]
-        self.env.load_state_dict(below(tensors, "env"))
+        super().load_state_dict(tensors)
 
 
 def stacked(flags: Sequence[Tensor | None]) -> Tensor | None:

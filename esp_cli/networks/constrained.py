@@ -11,7 +11,7 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from esp_cli.networks.contract import VJP, ActivationName, Generators, IoSpec, Memoryless, Network, NetworkConfig
+from esp_cli.networks.contract import ActivationName, Generators, IoSpec, Memoryless, Network, NetworkConfig, WithVJP
 from esp_cli.networks.layers import GAINS, SeedMLP, orthogonal
 from esp_cli.networks.perceptron import Shape, affine, perceptron, perceptron_with_vjp
 from esp_cli.symmetry import FiniteGroup
@@ -178,16 +178,16 @@ class Equivariant(Memoryless):
     def forward(self, x: Tensor) -> Tensor:
         return perceptron(self._shape, [x], self._plain())
 
-    def unroll_with_vjp(self, x: Tensor, truncation: int = 0) -> tuple[Tensor, VJP]:
+    def with_vjp(self, x: Tensor, shape: Sequence[int], truncation: int = 0, defer: bool = True) -> WithVJP:
         plain = self._plain()
         outputs, vjp = perceptron_with_vjp(self._shape, [x], plain)
 
         def vjp_of_free(slope: Tensor) -> list[Tensor]:
-            made = zip(plain, vjp(slope), strict=True)
+            made = zip(plain, vjp(slope.reshape(outputs.shape)), strict=True)
             learned, by_learned = zip(*((x, by_x) for x, by_x in made if x.requires_grad), strict=True)
-            return [*torch.autograd.grad(learned, [*self.parameters()], by_learned)]
+            return [*torch.autograd.grad(learned, self.learned, by_learned)]
 
-        return outputs, vjp_of_free
+        return WithVJP(outputs.reshape(shape), vjp_of_free, self.learned)
 
     def _plain(self) -> list[Tensor]:
         """Return weights and biases of the plain perceptron that this one is, in the order of `perceptron`."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Annotated, ClassVar, Literal
 
@@ -171,22 +172,23 @@ class Network(nn.Module, ABC):
         rows = x.transpose(2, 3)
         return self.unroll(rows.flatten(1, 2), truncation).unflatten(1, rows.shape[1:3]).transpose(2, 3)
 
-    def unroll_with_vjp(self, x: Tensor, truncation: int = 0) -> tuple[Tensor, VJP]:
-        """Return what `unroll_agents` does, without a graph, and its VJP, which autograd computes by default."""
+    @cached_property
+    def learned(self) -> list[Tensor]:
+        """All parameters; to list them takes as long as a product."""
+        return [*self.parameters()]
+
+    def with_vjp(self, x: Tensor, shape: Sequence[int], truncation: int = 0, defer: bool = True) -> WithVJP:
+        """Return what `unroll_agents` does, in another shape and without a graph, and its VJP, by default autograd's.
+
+        To `defer` lets a kernel compute the outputs later, together with a loss.
+        """
         outputs = self.unroll_agents(x, truncation)
 
         def vjp(slope: Tensor) -> list[Tensor]:
-            parameters = list(self.parameters())
-            return [*torch.autograd.grad(outputs, parameters, slope, allow_unused=True, materialize_grads=True)]
+            above = slope.reshape(outputs.shape)
+            return [*torch.autograd.grad(outputs, self.learned, above, allow_unused=True, materialize_grads=True)]
 
-        return outputs.detach(), vjp
-
-    def deferred(self, x: Tensor, parameters: Sequence[Tensor], shape: Sequence[int]) -> WithVJP | None:
-        """Return what `unroll_agents` would, in a shape, where a kernel may compute it together with a loss; or None.
-
-        `parameters` are all of the network's.
-        """
-        return None
+        return WithVJP(outputs.detach().reshape(shape), vjp, self.learned)
 
 
 class WithVJP:

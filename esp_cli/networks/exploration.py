@@ -10,20 +10,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.autograd import Function
 from torch.nn.functional import mse_loss
 
-from esp_cli.networks.heads import MASKED, Categorical, Choice, Head, best, drawn, same_disc, squash
+from esp_cli.networks.heads import MASKED, Bounded, Categorical, Choice, Head, best, drawn, squash
 from esp_envs.base import random_choice
-from esp_envs.spec import ActionSpace, Continuous, Discrete
+from esp_envs.spec import ActionSpace, Discrete
 
 
 class ExploringHead(Head):
     """A head with a measure of exploration per seed, `epsilon` [S] in [0, 1]."""
 
-    def __init__(self, num_seeds: int) -> None:
-        nn.Module.__init__(self)  # not super(): the constructor of a head beside this one wants other arguments
+    def __init__(self, space: ActionSpace, num_seeds: int) -> None:
+        super().__init__(space, num_seeds)  # of the head beside this one
         self.epsilon: Tensor
         self.register_buffer("epsilon", torch.ones(num_seeds))
 
@@ -34,15 +34,7 @@ class ExploringHead(Head):
         return self.epsilon.view(-1, *[1] * (like.dim() - 1))
 
 
-class ExploringChoice(ExploringHead, Choice):
-    """A head that explores and chooses one of A actions."""
-
-    def __init__(self, space: Discrete, num_seeds: int) -> None:
-        super().__init__(num_seeds)
-        self.num_outputs = space.count
-
-
-class EpsilonGreedy(ExploringChoice):
+class EpsilonGreedy(ExploringHead, Choice):
     """Outputs are action values; the best action, or with probability epsilon a uniformly random one."""
 
     def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
@@ -62,7 +54,7 @@ class EpsilonGreedy(ExploringChoice):
         return best(outputs)
 
 
-class ExploringCategorical(ExploringChoice, Categorical):
+class ExploringCategorical(ExploringHead, Categorical):
     """One of A allowed actions with probabilities (1 - epsilon) softmax(outputs) + epsilon / A."""
 
     def sample(self, log_probs: Tensor, noise: Tensor) -> Tensor:
@@ -123,21 +115,12 @@ class _StraightThrough(Function):
         return inner.addcmul_(soft, inner.sum(1, keepdim=True), value=-1).movedim(1, -1)
 
 
-class BoundedPoint(ExploringHead):
+class BoundedPoint(ExploringHead, Bounded):
     """A deterministic action: outputs squashed to the bounds. Behaviour adds Gaussian noise of deviation epsilon to it.
 
     The noisy action goes back to the bounds: planar vectors to the unit disc, other numbers to [-1, 1]. Squash, noise
     and bounds commute with every rotation and reflection of the action.
     """
-
-    def __init__(self, space: Continuous, num_seeds: int) -> None:
-        super().__init__(num_seeds)
-        self.num_outputs = space.width
-        self.disc: Tensor
-        self.register_buffer("disc", same_disc(space), False)
-
-    def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
-        return drawn(torch.randn, (*shape, self.num_outputs), generators)
 
     def sample(self, outputs: Tensor, noise: Tensor) -> Tensor:
         """Return the action plus noise, back within the bounds."""

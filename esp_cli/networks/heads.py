@@ -24,7 +24,6 @@ from esp_cli.networks.policies import (
     CompiledCategoricalPolicies,
     GaussianPolicies,
     Policies,
-    divergence_by_choice,
 )
 from esp_cli.symmetry.frame import Frame
 from esp_envs.spec import ActionSpace, Continuous, Discrete
@@ -80,7 +79,7 @@ class Head(nn.Module, ABC):
 class Choice(Head):
     """A head that chooses one of A actions."""
 
-    def __init__(self, space: Discrete) -> None:
+    def __init__(self, space: Discrete, num_seeds: int = 1) -> None:
         super().__init__()
         self.num_outputs = space.count
 
@@ -118,18 +117,29 @@ class Categorical(Choice):
         """Return - sum_a pi(a) log pi(a): [S, B, N]."""
         return -(log_probs.exp() * log_probs).sum(-1)
 
-    def divergence(self, p: Tensor, q: Tensor) -> Tensor:
-        """Return KL[p || q] of two sets of log-probabilities: [S, B, N]."""
-        return divergence_by_choice(p, q, p.exp()).sum(-1)
-
     def policies(self, outputs: WithVJP, frame: Frame) -> Policies:
         """Return the policies that outputs [S, P B, T, N, A] are, for losses with slopes."""
         compiled = outputs.waits or computes(self.compiled, outputs.tensor)
         orders = frame.orders(self.num_outputs) if compiled else None
-        return CategoricalPolicies(outputs, frame) if orders is None else CompiledCategoricalPolicies(outputs, orders)
+        if orders is None:
+            return CategoricalPolicies(outputs, frame)
+        return CompiledCategoricalPolicies(outputs, frame, orders)
 
 
-class BoundedGaussian(Head):
+class Bounded(Head):
+    """A head whose actions are numbers within bounds."""
+
+    def __init__(self, space: Continuous, num_seeds: int) -> None:
+        super().__init__()
+        self.num_outputs = space.width
+        self.disc: Tensor
+        self.register_buffer("disc", same_disc(space), False)
+
+    def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
+        return drawn(torch.randn, (*shape, self.num_outputs), generators)
+
+
+class BoundedGaussian(Bounded):
     """A Gaussian over an unbounded latent action, squashed to the task's bounds when it is sent to the task.
 
     outputs are the latent means; the log standard deviation is one learned number per item of the action layout (so
@@ -139,15 +149,12 @@ class BoundedGaussian(Head):
     """
 
     def __init__(self, space: Continuous, num_seeds: int) -> None:
-        super().__init__()
-        self.num_outputs = space.width
+        super().__init__(space, num_seeds)
         items = [f.kind for f in space.layout.fields for _ in range(f.count)]
         self.log_std = nn.Parameter(torch.full((num_seeds, len(items)), math.log(_INITIAL_STD)))
         self.item: Tensor
         item = torch.tensor([k for k, kind in enumerate(items) for _ in range(kind.width)])
         self.register_buffer("item", item, False)
-        self.disc: Tensor
-        self.register_buffer("disc", same_disc(space), False)
 
     def log_deviation(self, like: Tensor) -> Tensor:
         """Return the log deviation of each number, shaped to stand beside `like`: [S, ..., width]."""
@@ -156,9 +163,6 @@ class BoundedGaussian(Head):
     def policies(self, outputs: WithVJP, frame: Frame) -> GaussianPolicies:
         """Return the policies that outputs [S, P B, T, N, width] are, for losses with slopes."""
         return GaussianPolicies(outputs, frame, self.log_std, self.item)
-
-    def noise(self, shape: Sequence[int], generators: Sequence[torch.Generator]) -> Tensor:
-        return drawn(torch.randn, (*shape, self.num_outputs), generators)
 
     def sample(self, outputs: Tensor, noise: Tensor) -> Tensor:
         """Return the latent action mean + std * noise."""
@@ -175,10 +179,6 @@ class BoundedGaussian(Head):
     def entropy(self, outputs: Tensor) -> Tensor:
         entropy = (self.log_deviation(outputs) + 0.5 * math.log(2 * math.pi * math.e)).sum(-1)
         return entropy.expand(outputs.shape[:-1])
-
-    def divergence(self, p: Tensor, q: Tensor) -> Tensor:
-        """Return KL between two Gaussians that share their deviation: |mean_p - mean_q|^2 / (2 std^2)."""
-        return (0.5 * ((p - q) * (-self.log_deviation(p)).exp()).square()).sum(-1)
 
     def to_environment(self, action: Tensor) -> Tensor:
         return squash(action, self.disc)

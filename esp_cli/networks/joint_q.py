@@ -5,18 +5,18 @@ Shape letters: S seeds, W agents' scenes (any axes), N agents, C values (1 or N)
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
-from torch.autograd import Function
 from torch.nn.functional import elu
 
 from esp_cli.networks.contract import Generators
 from esp_cli.networks.kernels.library import begin, computes
 from esp_cli.networks.kernels.mixer import CompiledMixer
 from esp_cli.networks.layers import SeedLinear, SeedMLP
-from esp_cli.networks.perceptron import CACHED_ROWS, affine
+from esp_cli.networks.perceptron import CACHED_ROWS, affine, passed
 from esp_envs.spec import Spaces
 
 
@@ -36,17 +36,9 @@ class SharedCriticInput:
         """Return what the critic sees of scenes with obs [S, W, N, D] and state [S, W, G]: [S, W, width]."""
         return state if self.reads == "state" else obs.flatten(-2)
 
-    def inputs(self, seen: Tensor, action: Tensor) -> Tensor:
-        """Return the critic's inputs [S, ..., D] for encoded joint actions [S, W, N, A]."""
-        return torch.cat([seen, self.joint_action(action)], -1)
-
-    def joint_action(self, action: Tensor) -> Tensor:
-        """Return encoded joint actions [S, W, N, A] as the critic reads them: [S, ..., N A]."""
-        return action.flatten(-2)
-
     def value(self, critic: nn.Module, seen: Tensor, action: Tensor) -> Tensor:
         """Return Q [S, W, C] of encoded joint actions [S, W, N, A]; `seen` is what the critic sees of the scenes."""
-        return critic(seen, self.joint_action(action))
+        return critic(seen, action.flatten(-2))
 
     def exchanged(self, critic: nn.Module, seen: Tensor, joint: Tensor, others: Tensor) -> Tensor:
         """Return each agent's Q [S, W, N, K] for its other actions, with the actions of all others fixed.
@@ -74,12 +66,8 @@ class PerAgentCriticInput(SharedCriticInput):
             return in_circular_order(obs)
         return torch.cat([state.unsqueeze(-2).expand(*obs.shape[:-1], -1), obs], -1)
 
-    def joint_action(self, action: Tensor) -> Tensor:
-        """Return encoded joint actions [S, W, N, A] for each agent: [S, W, N, N A]."""
-        return in_circular_order(action)
-
     def value(self, critic: nn.Module, seen: Tensor, action: Tensor) -> Tensor:
-        return super().value(critic, seen, action).squeeze(-1)
+        return critic(seen, in_circular_order(action)).squeeze(-1)
 
     def exchanged(self, critic: nn.Module, seen: Tensor, joint: Tensor, others: Tensor) -> Tensor:
         """Return each agent's own Q for its other actions: [S, W, N, K]; arguments as of `SharedCriticInput`."""
@@ -126,8 +114,8 @@ def _one_by_one(network: nn.Module, rows: Tensor, items: Tensor, others: Tensor)
     num_rows, num_items, num_others = others.shape[1:4]
     own = torch.eye(num_items, dtype=torch.bool, device=rows.device).view(num_items, 1, num_items, 1)
     joint = torch.where(own, others.unsqueeze(4), items.view(-1, num_rows, 1, 1, *items.shape[2:])).flatten(-2)
-    full = torch.cat([rows.view(-1, num_rows, 1, 1, rows.shape[-1]).expand(*joint.shape[:-1], -1), joint], -1)
-    return network(full.flatten(1, 3)).unflatten(1, (num_rows, num_items, num_others))
+    here = rows.view(-1, num_rows, 1, 1, rows.shape[-1]).expand(*joint.shape[:-1], -1)
+    return network(here.flatten(1, 3), joint.flatten(1, 3)).unflatten(1, (num_rows, num_items, num_others))
 
 
 HYPER_GAIN = 0.5  # orthogonal gain of the hypernetwork's last layer
@@ -153,8 +141,8 @@ class MonotonicMixer(nn.Module):
         """Mix the agents' values [S, ..., N] by the state [S, ..., state width] to [S, ...]."""
         own = values.reshape(values.shape[0], -1, values.shape[-1])
         if computes(self.hypernetwork.compiled, state):
-            given = (own.contiguous(), state, *self.hypernetwork.parameters())
-            return _CompiledMixed.apply(self.width, torch.is_grad_enabled(), *given).view(values.shape[:-1])  # type: ignore[no-untyped-call]
+            mixer, inputs = partial(CompiledMixer, self.width), [own.contiguous(), state]
+            return passed(mixer, inputs, [*self.hypernetwork.parameters()]).view(values.shape[:-1])
         seen, size = state.reshape(len(state), -1, state.shape[-1]), max(1, CACHED_ROWS // values.shape[0])
         pieces = [self._mixed(*piece) for piece in zip(own.split(size, 1), seen.split(size, 1), strict=True)]
         return torch.cat(pieces, 1).view(values.shape[:-1])
@@ -166,19 +154,3 @@ class MonotonicMixer(nn.Module):
         weighed = first.unflatten(1, (self.num_agents, self.width)).abs() * own.transpose(1, 2).unsqueeze(2)
         hidden = elu(weighed.sum(1) + bias)
         return (hidden * second.abs()).sum(1) + offset.squeeze(1)
-
-
-class _CompiledMixed(Function):
-    """The mixer by the kernel, hypernetwork and all: own [S, B, N] in states [S, ..., width] to [S, B]."""
-
-    @staticmethod
-    def forward(ctx, width, keep, own, state, *parameters):  # type: ignore[no-untyped-def]
-        ctx.run = CompiledMixer(own, [state], parameters, width, keep)
-        ctx.save_for_backward(own, state, *parameters)  # so that autograd notices a change of them
-        return ctx.run.outputs.detach()  # the tensor itself would hold, by its grad_fn, what holds it
-
-    @staticmethod
-    def backward(ctx, grad):  # type: ignore[no-untyped-def]
-        _, state, *_ = ctx.saved_tensors
-        by_own, grads, (by_state,) = ctx.run.unmix(grad, ctx.needs_input_grad[4:], ctx.needs_input_grad[3:4])
-        return None, None, by_own, None if by_state is None else by_state.view(state.shape), *grads

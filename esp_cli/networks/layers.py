@@ -7,13 +7,13 @@ learns the same alone and among ten.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
-from esp_cli.networks.kernels.library import computes, library
-from esp_cli.networks.perceptron import Deferred, Shape, activate_, affine, perceptron, perceptron_with_vjp
+from esp_cli.networks.kernels.library import library
+from esp_cli.networks.perceptron import Shape, activate_, affine, perceptron
 
 # orthogonal gain of a hidden layer, as in the MAPPO paper's code (torch.nn.init.calculate_gain)
 GAINS = {"relu": math.sqrt(2.0), "tanh": 5.0 / 3.0}
@@ -91,20 +91,10 @@ class SeedMLP(nn.Module):
         return self._from_layer(0, parts, rows_innermost)
 
     def from_first_sums(self, sums: Tensor) -> Tensor:
-        """Map the first layer's sums x W_1 + b_1 [S, B, H] to [S, B, out], in place; not with layer normalisation."""
-        if len(self.layers) == 1 and not self.activate_output:
+        """Map the first layer's sums x W_1 + b_1 [S, B, H] to [S, B, out], in place; not normed, nor activated last."""
+        if len(self.layers) == 1:
             return sums.float()
-        x = activate_(sums, self.activation)
-        return x.float() if len(self.layers) == 1 else self._from_layer(1, [x])
-
-    def forward_with_vjp(self, x: Tensor) -> tuple[Tensor, Callable[[Tensor], list[Tensor]]]:
-        """Map [S, ..., in] as `forward` does, without a graph, and return the VJP; not with layer normalisation."""
-        return perceptron_with_vjp(self._shape(), [x], self._from(0))
-
-    def deferred(self, x: Tensor, parameters: Sequence[Tensor], shape: Sequence[int]) -> Deferred | None:
-        """Return what `forward` gives for x [S, ..., in] in another shape, where the kernel is chosen; see there."""
-        chosen = self.norms is None and not self.activate_output and computes(self.compiled, x)
-        return Deferred(self._shape(), x, parameters, shape) if chosen else None
+        return self._from_layer(1, [activate_(sums, self.activation)])
 
     def _from_layer(self, first: int, parts: Sequence[Tensor], rows_innermost: bool = False) -> Tensor:
         return perceptron(self._shape(rows_innermost), parts, self._from(first))

@@ -139,19 +139,14 @@ class MpnConfig(NetworkConfig):
     def build(
         self, generators: Generators, inputs: int, outputs: int, output_gain: float, io: IoSpec | None
     ) -> Network:
-        return MessagePassing(generators, self.io_or_refuse(io), self, "c1", output_gain)
+        return MessagePassing(generators, self.io_or_refuse(io), self, getattr(self, "group", "c1"), output_gain)
 
 
-class EmpnConfig(NetworkConfig):
+class EmpnConfig(MpnConfig):
     """The settings of the equivariant message passing network."""
 
-    name: Literal["empn"] = "empn"
+    name: Literal["empn"] = "empn"  # type: ignore[assignment]
     group: str = Setting("c4", max_length=100, description="the layers commute with this group")
-
-    def build(
-        self, generators: Generators, inputs: int, outputs: int, output_gain: float, io: IoSpec | None
-    ) -> Network:
-        return MessagePassing(generators, self.io_or_refuse(io), self, self.group, output_gain)
 
 
 class MessagePassing(Memoryless):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
-from esp_cli.networks.contract import VJP, IoSpec, Network
+from esp_cli.networks.contract import IoSpec, Network, WithVJP
 from esp_cli.networks.kernels.library import begin, computes
 from esp_cli.networks.kernels.sets import sort_things
 from esp_envs.errors import UserError
@@ -73,8 +75,8 @@ class NearestFirst(Network):
     def unroll_agents(self, x: Tensor, truncation: int = 0) -> Tensor:
         return self.network.unroll_agents(self.sorted(x), truncation)
 
-    def unroll_with_vjp(self, x: Tensor, truncation: int = 0) -> tuple[Tensor, VJP]:
-        return self.network.unroll_with_vjp(self.sorted(x), truncation)
+    def with_vjp(self, x: Tensor, shape: Sequence[int], truncation: int = 0, defer: bool = True) -> WithVJP:
+        return self.network.with_vjp(self.sorted(x), shape, truncation, defer=False)
 
     @torch.no_grad()
     def sorted(self, x: Tensor) -> Tensor:

@@ -8,9 +8,9 @@ the same and is the reference in the tests.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import accumulate, pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -43,9 +43,17 @@ def perceptron(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tens
 
     The inputs [S, ..., d] are parts of x, side by side; gradients flow to those that ask for them.
     """
+    return passed(partial(_pass, shape), inputs, parameters).unflatten(1, inputs[0].shape[1:-1])
+
+
+def passed(make: Callable[..., Any], inputs: Sequence[Tensor], parameters: Sequence[Tensor]) -> Tensor:
+    """Return the outputs of `make(inputs, parameters, keep)`, through which gradients flow where there is a graph.
+
+    What it makes has `outputs`, and where it is to `keep` what it needs for that `backward_to`; see `_Pass`.
+    """
     if torch.is_grad_enabled():
-        return _Perceptron.apply(shape, len(inputs), *inputs, *parameters)  # type: ignore[no-untyped-call]
-    return _pass(shape, inputs, parameters, keep=False).outputs.unflatten(1, inputs[0].shape[1:-1])
+        return _Passed.apply(make, len(inputs), *inputs, *parameters)  # type: ignore[no-untyped-call]
+    return make(inputs, parameters, keep=False).outputs
 
 
 def perceptron_with_vjp(
@@ -94,12 +102,8 @@ def _pass(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor], 
 
 def _pieces(shape: Shape, inputs: Sequence[Tensor]) -> Iterator[Tensor]:
     """Return rows whose numbers lie side by side, some at a time."""
-    for parts in zip(*(_split(x, _size(x)) for x in inputs), strict=True):
+    for parts in zip(*(x.split(_size(x), 1) for x in inputs), strict=True):
         yield (parts[0] if len(parts) == 1 else torch.cat(parts, -1)).to(shape.precision)
-
-
-def _split(x: Tensor, size: int) -> Sequence[Tensor]:
-    return x.split(size, 1) if x.shape[1] > size else (x,)
 
 
 def _size(x: Tensor) -> int:
@@ -151,7 +155,7 @@ class _Pass:
         grads: list[Tensor | None] = [None] * (2 * len(weights))
         below: list[list[Tensor]] = [[] for _ in asked]
         columns = list(zip(asked, pairwise(accumulate(self._widths, initial=0)), below, strict=False))
-        for run, upper in zip(self._runs, _split(grad.to(shape.precision), self._size), strict=True):
+        for run, upper in zip(self._runs, grad.to(shape.precision).split(self._size, 1), strict=True):
             here = _backward(shape, run, upper, weights, learns, grads)
             for wanted, (begin, end), parts in columns:
                 if wanted:
@@ -161,21 +165,17 @@ class _Pass:
         return grads, [torch.cat(parts, 1).float() if parts else None for parts in below]
 
 
-class _Perceptron(Function):
-    """`perceptron` under autograd."""
-
+class _Passed(Function):
     @staticmethod
-    def forward(ctx, shape, num_inputs, *tensors):  # type: ignore[no-untyped-def]
-        inputs = tensors[:num_inputs]
-        ctx.num_inputs, ctx.run = num_inputs, _pass(shape, inputs, tensors[num_inputs:], keep=True)
+    def forward(ctx, make, num_inputs, *tensors):  # type: ignore[no-untyped-def]
+        ctx.num_inputs, ctx.run = num_inputs, make(tensors[:num_inputs], tensors[num_inputs:], keep=True)
         ctx.save_for_backward(*tensors)  # so that autograd notices a change of them
-        return ctx.run.outputs.detach().unflatten(1, inputs[0].shape[1:-1])
+        return ctx.run.outputs.detach()  # the tensor itself would hold, by its grad_fn, what holds it
 
     @staticmethod
     def backward(ctx, grad):  # type: ignore[no-untyped-def]
         inputs, first = ctx.saved_tensors[: ctx.num_inputs], 2 + ctx.num_inputs
-        learns, asked = ctx.needs_input_grad[first:], ctx.needs_input_grad[2:first]
-        grads, below = ctx.run.backward_to(grad.flatten(1, -2), learns, asked)
+        grads, below = ctx.run.backward_to(grad, ctx.needs_input_grad[first:], ctx.needs_input_grad[2:first])
         below = [None if by_x is None else by_x.view(x.shape) for by_x, x in zip(below, inputs, strict=True)]
         return None, None, *below, *grads
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import ClassVar, Literal
 
@@ -9,11 +10,11 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor, nn
 
-from esp_cli.networks.contract import VJP, ActivationName, Generators, IoSpec, Memoryless, Network, NetworkConfig
-from esp_cli.networks.kernels.library import WORTH_COMPILING, has_compiler
+from esp_cli.networks.contract import ActivationName, Generators, IoSpec, Memoryless, Network, NetworkConfig, WithVJP
+from esp_cli.networks.kernels.library import WORTH_COMPILING, computes, has_compiler
 from esp_cli.networks.layers import GAINS, SeedLayerNorm, SeedLinear, SeedMLP
 from esp_cli.networks.ordering import NearestFirst
-from esp_cli.networks.perceptron import Shape, perceptron
+from esp_cli.networks.perceptron import Deferred, Shape, perceptron, perceptron_with_vjp
 from esp_cli.networks.recurrent import SeedGRU
 from esp_envs.errors import UserError
 
@@ -53,8 +54,10 @@ class PlainConfig(CompiledConfig):
         "given", description="of like things in an observation; nearest: each set sorted by distance, the nearest first"
     )
 
-    def ordered(self, network: Network, io: IoSpec | None) -> Network:
-        """Return a network that reads rows in this order."""
+    def build(
+        self, generators: Generators, inputs: int, outputs: int, output_gain: float, io: IoSpec | None
+    ) -> Network:
+        network = (GRU if self.recurrent else MLP)(generators, inputs, outputs, self, output_gain)
         return network if self.order == "given" else NearestFirst(network, self.io_or_refuse(io), self.products[1])
 
     @property
@@ -86,11 +89,6 @@ class MlpConfig(PlainConfig):
 
     name: Literal["mlp"] = "mlp"
 
-    def build(
-        self, generators: Generators, inputs: int, outputs: int, output_gain: float, io: IoSpec | None
-    ) -> Network:
-        return self.ordered(MLP(generators, inputs, outputs, self, output_gain), io)
-
 
 class GruConfig(PlainConfig):
     """The settings of a recurrent network."""
@@ -98,11 +96,6 @@ class GruConfig(PlainConfig):
     recurrent: ClassVar[bool] = True
 
     name: Literal["gru"] = "gru"
-
-    def build(
-        self, generators: Generators, inputs: int, outputs: int, output_gain: float, io: IoSpec | None
-    ) -> Network:
-        return self.ordered(GRU(generators, inputs, outputs, self, output_gain), io)
 
 
 class MLP(SeedMLP, Memoryless):
@@ -117,8 +110,13 @@ class MLP(SeedMLP, Memoryless):
     def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
         return self(x)
 
-    def unroll_with_vjp(self, x: Tensor, truncation: int = 0) -> tuple[Tensor, VJP]:
-        return super().unroll_with_vjp(x, truncation) if self.norms is not None else self.forward_with_vjp(x)
+    def with_vjp(self, x: Tensor, shape: Sequence[int], truncation: int = 0, defer: bool = True) -> WithVJP:
+        if self.norms is not None:
+            return super().with_vjp(x, shape, truncation)
+        if defer and computes(self.compiled, x):
+            return Deferred(self._shape(), x, self.learned, shape)
+        outputs, vjp = perceptron_with_vjp(self._shape(), [x], self.learned)
+        return WithVJP(outputs.reshape(shape), lambda slope: vjp(slope.reshape(outputs.shape)), self.learned)
 
 
 class GRU(Network):

@@ -7,16 +7,14 @@ actions, W numbers of a continuous action. The first L parts are those that a le
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from functools import cached_property
 from math import prod
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from esp_cli.networks.contract import WithVJP
-from esp_cli.networks.kernels.choices import Clipped, CompiledChoices, Slope
+from esp_cli.networks.kernels.choices import Clipped, Slope, divergences
 from esp_cli.networks.perceptron import Deferred
 from esp_cli.symmetry.frame import Frame
 
@@ -25,37 +23,7 @@ _HALF_LOG_TAU = 0.5 * math.log(2 * math.pi)
 Weights = Tensor | float  # A number, or [S, 1, R]
 
 
-class Policies(ABC):
-    """What a network outputs for originals and copies, as policies."""
-
-    sizes: tuple[int, ...]  # S, P and R
-
-    @abstractmethod
-    def log_prob(self, action: Tensor, learned: int) -> Tensor:
-        """Return log pi(action) [S, L, R] of the originals' actions [S, B, T, N(, W)]."""
-
-    @abstractmethod
-    def entropy(self, learned: int) -> Tensor:
-        """Return the entropies [S, L, R]."""
-
-    @abstractmethod
-    def divergence(self, copies: slice, originals: slice) -> Tensor:
-        """Return KL[copy || original] [S, K, R] of some parts."""
-
-    @abstractmethod
-    def add_slope(self, slope: Any, action: Tensor, by_log_prob: Tensor, by_entropy: Weights) -> Any:
-        """Add the slope of what depends on log pi(action), by which it is [S, L, R], and on these entropies."""
-
-    @abstractmethod
-    def add_divergence_slope(self, slope: Any, weights: Weights) -> Any:
-        """Add the slope of the sum of divergences times weights."""
-
-    @abstractmethod
-    def back(self, slope: Any) -> list[tuple[WithVJP, Tensor]]:
-        """Return what networks returned, and the slopes by it."""
-
-
-class CategoricalPolicies(Policies):
+class CategoricalPolicies:
     """Choices among A actions with probabilities softmax(outputs), actions first; see `Categorical.normalise`.
 
     A slope is by log-probabilities [S, A, P, R], up to a multiple of the probabilities: the softmax takes it away.
@@ -75,19 +43,23 @@ class CategoricalPolicies(Policies):
         self._inner, self.sizes = self.probs * self.log_probs, (len(logits), *self.probs.shape[2:])
 
     def log_prob(self, action: Tensor, learned: int) -> Tensor:
+        """Return log pi(action) [S, L, R] of the originals' actions [S, B, T, N(, W)]."""
         return self.log_probs.gather(1, _index(action, learned)).squeeze(1)
 
     def entropy(self, learned: int) -> Tensor:
+        """Return the entropies [S, L, R]."""
         return self._inner[:, :, :learned].sum(1).neg_()
 
     def divergence(self, copies: slice, originals: slice) -> Tensor:
+        """Return KL[copy || original] [S, K, R] of some parts."""
         return self._gap(copies, originals).sum(1)
 
     def _gap(self, copies: slice, originals: slice) -> Tensor:
         p, log_p, log_q = self.probs[:, :, copies], self.log_probs[:, :, copies], self.log_probs[:, :, originals]
-        return divergence_by_choice(log_p, log_q, p)
+        return p * (log_p - log_q)
 
     def add_slope(self, slope: Tensor | None, action: Tensor, by_log_prob: Tensor, by_entropy: Weights) -> Tensor:
+        """Add the slope of what depends on log pi(action), by which it is [S, L, R], and on these entropies."""
         learned = by_log_prob.shape[1]
         if slope is None and learned == self.sizes[1]:
             slope = self._inner * -_beside(by_entropy)
@@ -97,6 +69,7 @@ class CategoricalPolicies(Policies):
         return slope.scatter_add_(1, _index(action, learned), by_log_prob.unsqueeze(1))
 
     def add_divergence_slope(self, slope: Tensor | None, weights: Weights) -> Tensor:
+        """Add the slope of the sum of divergences times weights."""
         slope, weights = torch.zeros_like(self.probs) if slope is None else slope, _beside(weights)
         slope[:, :, 1:].add_(self._gap(slice(1, None), slice(1)).mul_(weights))
         by_original = self.probs[:, :, 1:] * weights
@@ -104,6 +77,7 @@ class CategoricalPolicies(Policies):
         return slope
 
     def back(self, slope: Tensor) -> list[tuple[WithVJP, Tensor]]:
+        """Return what networks returned, and the slopes by it."""
         by_logits = torch._log_softmax_backward_data(slope, self.log_probs, 1, slope.dtype)
         rows = self._outputs.size[1:-1]
         if self._places is not None:
@@ -114,46 +88,43 @@ class CategoricalPolicies(Policies):
         return [(self._outputs, self._frame.push_outputs(by_logits))]
 
 
-class CompiledCategoricalPolicies(Policies):
-    """`CategoricalPolicies` by a kernel, of copies that only reorder outputs; a slope lists what it is to add up."""
+class CompiledCategoricalPolicies:
+    """`CategoricalPolicies` by a kernel, of copies that only reorder outputs; a slope says what to ask of it."""
 
-    def __init__(self, outputs: WithVJP, orders: Tensor) -> None:
-        self._outputs = outputs
+    def __init__(self, outputs: WithVJP, frame: Frame, orders: Tensor) -> None:
+        self._outputs, self._frame = outputs, frame
         num_seeds, *rows, _ = outputs.size
-        self._orders = orders.expand(num_seeds, -1, -1)
-        self.sizes = (num_seeds, orders.shape[1], prod(rows) // orders.shape[1])
+        self._orders = orders.expand(num_seeds, -1, -1).contiguous()
+        self.sizes = (num_seeds, frame.parts, prod(rows) // frame.parts)
 
     @cached_property
-    def _choices(self) -> CompiledChoices:
-        return CompiledChoices(self._outputs.tensor.flatten(1, -2), self._orders)
+    def _by_torch(self) -> CategoricalPolicies:
+        return CategoricalPolicies(self._outputs, self._frame)
 
     def log_prob(self, action: Tensor, learned: int) -> Tensor:
-        return self._choices.numbers.log_probs.gather(1, _index(action, learned)).squeeze(1)
+        return self._by_torch.log_prob(action, learned)
 
     def entropy(self, learned: int) -> Tensor:
-        return self._choices.numbers.entropies[:, :learned]
+        return self._by_torch.entropy(learned)
 
     def divergence(self, copies: slice, originals: slice) -> Tensor:
         assert originals == slice(0, 1)
-        return self._choices.numbers.gaps[:, copies]
+        return divergences(self._outputs.tensor.flatten(1, -2), self._orders)[:, copies]
 
-    def add_slope(self, slope: Any, action: Tensor, by_log_prob: Tensor, by_entropy: Weights) -> list[Slope]:
-        return [*(slope or []), Slope(chosen=(action, by_log_prob, by_entropy))]
+    def add_clipped_slope(self, slope: Slope | None, clipped: Clipped) -> Slope:
+        """Add the slope of a clipped objective and of entropies, one of each."""
+        return (slope or Slope())._replace(clipped=clipped)
 
-    def add_clipped_slope(self, slope: Any, clipped: Clipped) -> list[Slope]:
-        """Add the slope of a clipped objective and of entropies, which the kernel computes with it."""
-        return [*(slope or []), Slope(clipped=clipped)]
+    def add_divergence_slope(self, slope: Slope | None, weights: Weights) -> Slope:
+        before = slope or Slope()
+        return before._replace(gaps=weights if before.gaps is None else before.gaps + weights)
 
-    def add_divergence_slope(self, slope: Any, weights: Weights) -> list[Slope]:
-        *before, last = slope or [Slope()]
-        return [*before, last._replace(gaps=weights)] if last.gaps is None else [*before, last, Slope(gaps=weights)]
-
-    def back(self, slope: list[Slope]) -> list[tuple[WithVJP, Tensor]]:
+    def back(self, slope: Slope) -> list[tuple[WithVJP, Tensor]]:
         outputs = self._outputs
-        if isinstance(outputs, Deferred) and outputs.waits and len(slope) == 1:
-            return [(outputs.learn(lambda run: slope[0].learn(run, self._orders), self.sizes[1]), self._orders)]
-        first, *others = map(self._choices.back, slope)
-        return [(outputs, sum(others, start=first).unflatten(1, outputs.size[1:-1]))]
+        if isinstance(outputs, Deferred) and outputs.waits:
+            return [(outputs.learn(lambda run: slope.learn(run, self._orders), self.sizes[1]), self._orders)]
+        by_outputs = slope.back(outputs.tensor.flatten(1, -2), self._orders)
+        return [(outputs, by_outputs.unflatten(1, outputs.size[1:-1]))]
 
 
 def _places(orders: Tensor) -> Tensor:
@@ -164,22 +135,16 @@ def _places(orders: Tensor) -> Tensor:
     return torch.add(first, orders.transpose(1, 2), alpha=num_parts).flatten()
 
 
-def divergence_by_choice(log_p: Tensor, log_q: Tensor, p: Tensor) -> Tensor:
-    """Return p (log p - log q) for each choice, whose sum over the choices is KL[p || q]."""
-    return p * (log_p - log_q)
-
-
 def _index(action: Tensor, learned: int) -> Tensor:
     """Return actions [S, B, T, N] as the index [S, 1, L, R]."""
     return action.reshape(len(action), 1, 1, -1).expand(-1, -1, learned, -1)
 
 
 def _beside(weights: Weights) -> Weights:
-    """Return weights shaped to stand beside numbers of actions."""
     return weights.unsqueeze(1) if isinstance(weights, Tensor) else weights
 
 
-class GaussianPolicies(Policies):
+class GaussianPolicies:
     """Gaussians whose means are the outputs, with one log deviation of each item for all rows.
 
     An item moved by a copy has the deviation of its new place. Slopes are by means [S, P, R, W] and deviations [S,
@@ -249,7 +214,6 @@ class GaussianPolicies(Policies):
         return torch.zeros_like(self._means), torch.zeros_like(self._deviation.tensor)
 
     def _of(self, x: Tensor, parts: slice) -> Tensor:
-        """Return deviations or items of some parts."""
         return x if len(x[0]) == 1 else x[:, parts]
 
     def _add_by_items(self, total: Tensor, slopes: Tensor, parts: slice) -> None:
@@ -257,3 +221,6 @@ class GaussianPolicies(Policies):
         item = self._of(self._item, parts)
         slopes = slopes.sum((1, 2), keepdim=True) if item.shape[2] == 1 else slopes
         total.scatter_add_(1, item.expand_as(slopes).flatten(1), slopes.flatten(1))
+
+
+Policies = CategoricalPolicies | CompiledCategoricalPolicies | GaussianPolicies

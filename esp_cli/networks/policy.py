@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import Any
 
 import torch
@@ -90,15 +89,8 @@ class StochasticPolicy(Policy):
     def unroll_with_vjp(self, obs: Tensor, truncation: int = 0, action_mask: Tensor | None = None) -> WithVJP:
         """Return the outputs as they are but for the mask, for losses; see `unroll`."""
         shape = (*obs.shape[:-1], self.head.num_outputs)
-        if action_mask is None and (later := self.actor.deferred(obs, self._learned, shape)) is not None:
-            return later
-        outputs, vjp = self.actor.unroll_with_vjp(obs, truncation)
-        return WithVJP(masked(outputs, action_mask), vjp, self._learned)
-
-    @cached_property
-    def _learned(self) -> list[Tensor]:
-        """The actor's parameters; to list them takes as long as a product."""
-        return [*self.actor.parameters()]
+        given = self.actor.with_vjp(obs, shape, truncation, defer=action_mask is None)
+        return given if action_mask is None else WithVJP(masked(given.tensor, action_mask), given.vjp, given.parameters)
 
 
 class HistoryPolicy(Policy):
@@ -175,24 +167,13 @@ class Critic(nn.Module):
 
     def unroll(self, obs: Tensor, state: Tensor, truncation: int = 0) -> Tensor:
         """Return the values [S, B, T, C] over whole episodes obs [S, B, T, N, D] and state [S, B, T, state width]."""
-        return self._values(self.network.unroll_agents(self._rows(obs, state), truncation))
+        values = self.network.unroll_agents(self._rows(obs, state), truncation)
+        return values.squeeze(4 if self.reads == "own" else 3)
 
     def unroll_with_vjp(self, obs: Tensor, state: Tensor, truncation: int = 0) -> WithVJP:
-        rows = self._rows(obs, state)
-        if (later := self.network.deferred(rows, self._learned, (*obs.shape[:3], self.num_values))) is not None:
-            return later
-        outputs, vjp = self.network.unroll_with_vjp(rows, truncation)
-        return WithVJP(self._values(outputs), lambda slope: vjp(slope.view(outputs.shape)), self._learned)
-
-    @cached_property
-    def _learned(self) -> list[Tensor]:
-        """The parameters; to list them takes as long as a product."""
-        return [*self.network.parameters()]
+        return self.network.with_vjp(self._rows(obs, state), (*obs.shape[:3], self.num_values), truncation)
 
     def _rows(self, obs: Tensor, state: Tensor) -> Tensor:
         if self.reads == "own":
             return obs
         return (state if self.reads == "state" else obs.flatten(-2)).unsqueeze(3)
-
-    def _values(self, outputs: Tensor) -> Tensor:
-        return outputs.squeeze(4 if self.reads == "own" else 3)

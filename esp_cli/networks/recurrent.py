@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import torch
 from torch import Tensor, nn
-from torch.autograd import Function
 
 from esp_cli.networks.kernels.library import begin, computes
 from esp_cli.networks.kernels.recurrent import CompiledUnroll
 from esp_cli.networks.layers import SeedLinear
-from esp_cli.networks.perceptron import activate_
+from esp_cli.networks.perceptron import activate_, passed
 
 
 class SeedGRU(nn.Module):
@@ -42,15 +42,8 @@ class SeedGRU(nn.Module):
 
     def unroll(self, x: Tensor, truncation: int = 0) -> Tensor:
         """Advance through whole episodes from empty memory: x [S, T, B, in] -> every memory [S, T, B, H]."""
-        layers = (self.input.weight, self.input.bias, self.recurrent.weight, self.recurrent.bias)
-        if torch.is_grad_enabled():
-            return _Unrolled.apply(x, truncation, self.compiled, *layers)  # type: ignore[no-untyped-call]
-        return _run(x, truncation, self.compiled, layers, keep=False).memories
-
-
-def _run(x: Tensor, truncation: int, compiled: bool, layers: Sequence[Tensor], keep: bool) -> _Unroll | CompiledUnroll:
-    """Return a run by the kernel where it is chosen, else by torch's operations."""
-    return (CompiledUnroll if computes(compiled, x) else _Unroll)(x, layers, truncation, keep)
+        unroll = CompiledUnroll if computes(self.compiled, x) else _Unroll
+        return passed(partial(unroll, truncation), [x], [*self.parameters()])
 
 
 def _gates(weight: Tensor) -> Tensor:
@@ -59,10 +52,10 @@ def _gates(weight: Tensor) -> Tensor:
 
 
 class _Unroll:
-    """All steps of a gated recurrent unit from empty memory by torch, of x [S, T, B, in]."""
+    """All steps of a gated recurrent unit by torch, from empty memory; see `CompiledUnroll`."""
 
-    def __init__(self, x: Tensor, layers: Sequence[Tensor], truncation: int, keep: bool) -> None:
-        weight, bias, recurrent, inner_bias = layers
+    def __init__(self, truncation: int, inputs: Sequence[Tensor], layers: Sequence[Tensor], keep: bool) -> None:
+        (x,), (weight, bias, recurrent, inner_bias) = inputs, layers
         self._x, self._weights, self._truncation = x, (weight, recurrent), truncation
         (w_r, w_z, w_n), (u_r, u_z, u_n) = _gates(weight), _gates(recurrent)
         (b_r, b_z, _), (_, _, c_n), (_, _, b_n) = _gates(bias + inner_bias), _gates(inner_bias), _gates(bias)
@@ -82,71 +75,34 @@ class _Unroll:
             torch.baddbmm(b_n, now, w_n, out=candidate).addcmul_(reset, inner)
             activate_(candidate, "tanh")
             torch.lerp(candidate, memory, update, out=self._all[:, t + 1])
-        self.memories = self._all[:, 1:]
+        self.outputs = self._all[:, 1:]
 
-    def backward(self, grad: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """Return the gradients by x and by the layers of what has this gradient by the memories."""
-        x, learned = self._x, _Learned(*self._weights)
+    def backward_to(self, grad: Tensor, *_: Sequence[bool]) -> tuple[list[Tensor], list[Tensor]]:
+        """Return the gradients by all layers and by x of what has this gradient by the memories."""
+        x, (inputs, memories) = self._x, map(_gates, self._weights)
+        by_inputs, by_memories = torch.zeros_like(inputs), torch.zeros_like(memories)
         by_x, carry = torch.empty_like(x), torch.zeros_like(self._all[:, 0])
         d = carry.new_empty(4, *carry.shape)  # by r, z and n before their activations, and by h U_n + b_n
-        gap = torch.empty_like(carry)
+        gap, by_sums = torch.empty_like(carry), carry.new_zeros(4, len(carry), 1, carry.shape[2])
+        (w_r, w_z, w_n), (u_r, u_z, u_n) = inputs.transpose(2, 3), memories.transpose(2, 3)
         for t, (gates, inner) in reversed([*enumerate(self._kept)]):
             (reset, update, candidate), before = gates, self._all[:, t]
             carry += grad[:, t]
-            passed = carry * update
-            torch.ops.aten.tanh_backward.grad_input(torch.sub(carry, passed, out=gap), candidate, grad_input=d[2])
+            past = carry * update
+            torch.ops.aten.tanh_backward.grad_input(torch.sub(carry, past, out=gap), candidate, grad_input=d[2])
             torch.mul(d[2], inner, out=d[0])
             torch.mul(torch.sub(before, candidate, out=gap), carry, out=d[1])
             torch.ops.aten.sigmoid_backward.grad_input(d[:2], gates[:2], grad_input=d[:2])
             torch.mul(d[2], reset, out=d[3])
-            by_x[:, t] = learned.add(d, x[:, t], before)
+            by_sums += d.sum(2, keepdim=True)
+            for k, by_memory in enumerate((0, 1, 3)):
+                by_inputs[k].baddbmm_(x[:, t].transpose(1, 2), d[k])
+                by_memories[k].baddbmm_(before.transpose(1, 2), d[by_memory])
+            by_x[:, t] = torch.bmm(d[0], w_r).baddbmm_(d[1], w_z).baddbmm_(d[2], w_n)
             if self._truncation and t % self._truncation == 0:
                 carry.zero_()
             else:
-                carry = learned.through_time(d, passed)
-        return by_x, learned.gradients()
-
-
-class _Unrolled(Function):
-    """All steps of a gated recurrent unit; `SeedGRU.forward` under autograd is the reference in the tests."""
-
-    @staticmethod
-    def forward(ctx, x, truncation, compiled, *layers):  # type: ignore[no-untyped-def]
-        ctx.run = _run(x, truncation, compiled, layers, keep=True)
-        ctx.save_for_backward(x, *layers)  # so that autograd notices a change of them
-        return ctx.run.memories.detach()  # the tensor itself would hold, by its grad_fn, what holds it
-
-    @staticmethod
-    def backward(ctx, grad):  # type: ignore[no-untyped-def]
-        _ = ctx.saved_tensors
-        by_x, by_layers = ctx.run.backward(grad)
-        return by_x, None, None, *by_layers
-
-
-class _Learned:
-    """The weights of a gated recurrent unit by gates, and the gradients by them, a sum over the steps."""
-
-    def __init__(self, weight: Tensor, recurrent: Tensor) -> None:
-        self.inputs, self.memories = _gates(weight), _gates(recurrent)
-        self.by_inputs, self.by_memories = torch.zeros_like(self.inputs), torch.zeros_like(self.memories)
-        self.by_sums = weight.new_zeros(4, weight.shape[0], 1, self.inputs.shape[-1])
-
-    def add(self, d: Tensor, x: Tensor, memory: Tensor) -> Tensor:
-        """Add a step's gradients, known those by its sums [4, S, B, H], and return that by its input [S, B, in]."""
-        x, memory = x.transpose(1, 2), memory.transpose(1, 2)
-        self.by_sums += d.sum(2, keepdim=True)
-        for k, (by_input, by_memory) in enumerate(zip(self.by_inputs, self.by_memories, strict=True)):
-            by_input.baddbmm_(x, d[k])
-            by_memory.baddbmm_(memory, d[k if k < 2 else 3])
-        w_r, w_z, w_n = self.inputs.transpose(2, 3)
-        return torch.bmm(d[0], w_r).baddbmm_(d[1], w_z).baddbmm_(d[2], w_n)
-
-    def through_time(self, d: Tensor, passed: Tensor) -> Tensor:
-        """Return the gradient by the memory before a step, added to what passes it by; in place."""
-        u_r, u_z, u_n = self.memories.transpose(2, 3)
-        return passed.baddbmm_(d[0], u_r).baddbmm_(d[1], u_z).baddbmm_(d[3], u_n)
-
-    def gradients(self) -> list[Tensor]:
-        r, z, n, inner = self.by_sums
-        parts = ((*self.by_inputs,), (r, z, n), (*self.by_memories,), (r, z, inner))
-        return [torch.cat(gates, -1) for gates in parts]
+                carry = past.baddbmm_(d[0], u_r).baddbmm_(d[1], u_z).baddbmm_(d[3], u_n)
+        r, z, n, inner = by_sums
+        parts = (by_inputs.unbind(0), (r, z, n), by_memories.unbind(0), (r, z, inner))
+        return [torch.cat(gates, -1) for gates in parts], [by_x]

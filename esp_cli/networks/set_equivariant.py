@@ -82,7 +82,10 @@ class InvariantRows(Rows):
     ) -> None:
         super().__init__(layout, shifts, near, compiled)
         self.own_columns = _columns([part.field for part in layout.own if part.where in self.own])
-        one = [[_one(part.field) for part in family.parts] for family in self.families]
+        one = [
+            [Field(part.field.name, part.field.kind, 1, parts=part.field.parts) for part in family.parts]
+            for family in self.families
+        ]
         self.columns = [_columns(fields) for fields in one]
         count = len(self.own_columns[0])
         self.num_own = len(self.own_columns[1]) + count * (count + 3) // 2
@@ -120,10 +123,6 @@ class InvariantRows(Rows):
 def _each(x: Tensor, count: int) -> Tensor:
     """Return [S, B, ...] once for each direction: [S, B, A, ...]."""
     return x.unsqueeze(2).expand(-1, -1, count, *x.shape[2:])
-
-
-def _one(field: Field) -> Field:
-    return Field(field.name, field.kind, 1, field.unit, parts=field.parts)
 
 
 def _picked(numbers: Tensor, columns: Sequence[int]) -> Tensor:

@@ -53,9 +53,6 @@ class SetConfig(SetShape):
     def mixer(self, generators: Generators, io: IoSpec, width: int, further: int) -> nn.Module | None:
         return SetMixer(generators, io, self, width, further)
 
-    def least_parameters(self, inputs: int) -> int:
-        return self.width + self.hidden[0]
-
 
 def sets_or_refuse(name: str, io: IoSpec) -> IoSpec:
     """Return what a network reads, where an actor sees like things; else raise a UserError."""
@@ -127,15 +124,12 @@ class SetQ(nn.Module):
         super().__init__()
         self.features = TeamFeatures(generators, io, config, actions)
         self.features.each_or_refuse(io)
-        self.width, self.actions, self.num_joint = io.layout.width, actions, io.spaces.num_agents * actions
+        self.width, self.actions = io.layout.width, actions
         sizes = (self.features.width + further, *config.hidden, 1)
         self.head = SeedMLP(generators, sizes, config.activation, 1.0, compiled=config.compiled is True)
 
-    def forward(self, seen: Tensor, action: Tensor | None = None) -> Tensor:
-        """Return Q [S, ..., 1] of what is seen [S, ..., D] and joint actions [S, ..., N A], also side by side."""
-        if action is None:
-            width = seen.shape[-1] - self.num_joint
-            seen, action = seen[..., :width], seen[..., width:]
+    def forward(self, seen: Tensor, action: Tensor) -> Tensor:
+        """Return Q [S, ..., 1] of what is seen [S, ..., D] and joint actions [S, ..., N A]."""
         rows = seen.flatten(1, -2)
         own = action.flatten(1, -2).unflatten(-1, (-1, self.actions))
         parts, _ = self.features(rows[..., : self.width], own)

@@ -23,7 +23,7 @@ from esp_cli.networks.heads import Categorical
 from esp_cli.networks.plain import MlpConfig
 from esp_cli.networks.policy import StochasticPolicy
 from esp_cli.prior import Loss, PriorConfig, SeedBatch, SymmetryPrior, copies, mean_per_seed
-from esp_cli.prior.losses import policy_consistency_loss, value_consistency_loss
+from esp_cli.prior.losses import value_consistency_loss
 from esp_cli.symmetry import transform_set
 from esp_envs import Field, Kind, Spaces, layout
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Continuous, Discrete, Layout
@@ -38,6 +38,14 @@ SPACES = Spaces(
     action=Discrete(Kind.VECTOR, (RIGHT, UP, LEFT, DOWN), ("right", "up", "left", "down")),
     symmetry="d4*agents",
 )
+
+
+def divergence(head, p, q):
+    """Return KL[p || q] of normalised outputs."""
+    if isinstance(head, Categorical):
+        return (p.exp() * (p - q)).sum(-1)
+    deviation = head.log_deviation(p).exp()
+    return kl_divergence(Normal(p, deviation), Normal(q, deviation)).sum(-1)
 
 
 def reference_loss(trained, made, entropy_coef):
@@ -62,7 +70,7 @@ def reference_loss(trained, made, entropy_coef):
     gaps = []
     (here, *there), (value, *moved) = (x.split(made.originals.count, 1) for x in (outputs, values))
     for g, copy, of_copy in zip(made.transforms, there, moved, strict=True):
-        gap = policy_consistency_loss(head.divergence, g.pull_back(copy), here)
+        gap = divergence(head, g.pull_back(copy), here)
         gaps.append(mean_per_seed(gap, made.originals.mask))
         gap = value_consistency_loss(g.values(of_copy), value)
         gaps.append(mean_per_seed(gap, made.originals.valued(trained.num_values)))

@@ -51,8 +51,6 @@ def test_a_seed_draws_the_same_alone_and_among_others():
 
 
 def test_more_episodes_than_there_is_room_for_are_refused():
-    with pytest.raises(ValueError, match="6 episodes at once do not fit into a replay of 5"):
-        replay().add(numbered_batch(SPEC, 2, 6))
     with pytest.raises(ValueError, match="one round brings 4 episodes, but replay_episodes is 3"):
         learner("qmix", algo__replay_episodes=3, prior__replay="stored", prior__transforms="rot90")
 

@@ -363,14 +363,14 @@ def test_the_vjp_is_that_of_autograd_through_the_layers(relax, relaxation, activ
     network = build_network(generators(0, 1), spec.observation.width, width, config, 1.0, IoSpec(spec, "own"))
     stir(network)
     x = torch.randn_like(obs).flatten(1, 2).unsqueeze(2)
-    outputs, vjp = network.unroll_with_vjp(x)
+    given = network.with_vjp(x, (*x.shape[:-1], width))
     first, second, last = network.layers
     act = getattr(torch, activation)
     expected = last(act(second(act(first(x.flatten(1, 2)))))).unsqueeze(2)
-    torch.testing.assert_close(outputs, expected.detach())
+    torch.testing.assert_close(given.tensor, expected.detach())
     torch.testing.assert_close(network.unroll(x), expected)
-    gradient, parameters = torch.randn_like(outputs), [*network.parameters()]
-    found = vjp(gradient)
+    gradient, parameters = torch.randn_like(given.tensor), [*network.parameters()]
+    found = given.vjp(gradient)
     for ours, theirs in zip(found, torch.autograd.grad(expected, parameters, gradient), strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-4)
     assert all(ours.abs().max() > 0 for ours in found), "negative control: no gradient is empty"

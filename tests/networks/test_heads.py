@@ -14,14 +14,11 @@ FORCE = layout(Field("force", Kind.VECTOR))
 WHEELS = layout(Field("wheels", Kind.WHEELS), Field("force", Kind.VECTOR))
 
 
-def test_categorical_log_probability_entropy_and_divergence_by_hand():
+def test_categorical_log_probability_and_entropy_by_hand():
     head = Categorical(SPEC.action)
     p = head.normalise(torch.tensor([8.0, 4.0, 2.0, 1.0, 1.0]).log().view(1, 1, 1, 5))  # 1/2 1/4 1/8 1/16 1/16
-    q = head.normalise(torch.zeros(1, 1, 1, 5))
     assert head.log_prob(p, torch.tensor([[[1]]])).item() == pytest.approx(math.log(0.25))
     assert head.entropy(p).item() == pytest.approx(1.875 * math.log(2))
-    assert head.divergence(p, q).item() == pytest.approx(math.log(5) - 1.875 * math.log(2), rel=1e-5)
-    assert head.divergence(p, p).item() == pytest.approx(0, abs=1e-6)
     assert head.mode(p).item() == 0
 
 
@@ -32,17 +29,15 @@ def test_categorical_samples_by_inverting_the_cumulative_distribution():
     assert head.sample(p, noise).flatten().tolist() == [0, 0, 1, 2, 3, 4]
 
 
-def test_gaussian_log_probability_entropy_and_divergence_equal_torch():
+def test_gaussian_log_probability_and_entropy_equal_torch():
     head = BoundedGaussian(Continuous(WHEELS), 2)
     with torch.no_grad():
         head.log_std.copy_(torch.tensor([[0.1, -0.5], [0.3, 0.2]]))
-    mean, other, action = (torch.randn(2, 5, 3, 4) for _ in range(3))
+    mean, action = (torch.randn(2, 5, 3, 4) for _ in range(2))
     deviation = head.log_std.exp()[:, [0, 0, 1, 1]].view(2, 1, 1, 4).expand(2, 5, 3, 4)
     theirs = torch.distributions.Independent(torch.distributions.Normal(mean, deviation), 1)
-    others = torch.distributions.Independent(torch.distributions.Normal(other, deviation), 1)
     torch.testing.assert_close(head.log_prob(mean, action), theirs.log_prob(action))
     torch.testing.assert_close(head.entropy(mean), theirs.entropy())
-    torch.testing.assert_close(head.divergence(mean, other), torch.distributions.kl_divergence(theirs, others))
 
 
 def test_squash_keeps_a_vector_in_the_disc_and_a_wheel_in_its_interval():

@@ -131,11 +131,11 @@ def test_unrolling_an_episode_equals_stepping_through_it(name):
 def test_the_vjp_is_that_of_autograd(name, norm):
     network = build_network(generators(0, 1), 6, 3, NETWORKS[name](hidden=(8, 8), layer_norm=norm), 1.0)
     x, gradient = torch.randn(2, 2, 3, 5, 6), torch.randn(2, 2, 3, 5, 3)  # episodes of five agents
-    outputs, vjp = network.unroll_with_vjp(x)
-    expected = network.unroll_agents(x)
+    given = network.with_vjp(x, gradient.shape)
+    outputs, expected = given.tensor, network.unroll_agents(x)
     torch.testing.assert_close(outputs, expected.detach())
     assert not outputs.requires_grad
-    found, parameters = vjp(gradient), list(network.parameters())
+    found, parameters = given.vjp(gradient), list(network.parameters())
     for ours, theirs in zip(found, torch.autograd.grad(expected, parameters, gradient), strict=True):
         torch.testing.assert_close(ours, theirs)
     assert all(ours.abs().max() > 0 for ours in found), "negative control: no gradient is empty"

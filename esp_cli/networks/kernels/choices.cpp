@@ -12,17 +12,16 @@ struct Choices {
     int64_t by_seed, by_part, by_row, by_action;  // steps between the outputs [S, P, R, A]
     const int64_t *orders;               // [S, P, A]: which output of a part is the original's action
     const float *outputs;
-    float *log_prob, *prob;  // [S, A, P, R]
-    float *entropy, *gap;    // [S, P, R]; the gap of a part is KL[part || original]
+    float *gaps;  // [S, P, R], KL[part || original]
 };
 
 // What losses add to the slope by the outputs. No data: they do not, or the weight is a number.
 struct Slope {
     int64_t learned, moves, old_parts;
     float entropy_weight, gap_weight, clip, clip_weight;
-    const int64_t *action;                                     // [S, R]
-    const float *by_log_prob, *entropy_weights, *gap_weights;  // [S, L, R], [S, R], [S, R]
-    const float *old, *advantage, *clip_weights;  // [S, 1 or L, R], [S, R], [S, R]: of the clipped objective instead
+    const int64_t *action;                        // [S, R]
+    const float *entropy_weights, *gap_weights;   // [S, R] each
+    const float *old, *advantage, *clip_weights;  // [S, 1 or L, R], [S, R], [S, R]
 };
 
 // Some rows of a seed.
@@ -33,9 +32,6 @@ struct Batch {
     int64_t output(int64_t part, int64_t lane, int64_t a) const {
         return seed * of.by_seed + part * of.by_part + (begin + lane) * of.by_row +
                of.orders[(seed * of.parts + part) * of.actions + a] * of.by_action;
-    }
-    int64_t number(int64_t part, int64_t a) const {
-        return ((seed * of.actions + a) * of.parts + part) * of.rows + begin;
     }
     int64_t row(int64_t part, int64_t parts) const { return (seed * parts + part) * of.rows + begin; }
     Vec read(const float *x, int64_t at) const { return load(x + at, count); }
@@ -69,21 +65,6 @@ void softmax(const Batch &batch, int64_t part, Vec *log_prob) {
     }
 }
 
-// Write what is known of a part; `first` are the log-probabilities of the originals.
-void write(const Batch &batch, int64_t part, const Vec *first, const Vec *log_prob) {
-    const Choices &of = batch.of;
-    const Vec *prob = log_prob + of.actions;
-    Vec entropy = {}, gap = {};
-    for (int64_t a = 0; a < of.actions; a++) {
-        entropy -= prob[a] * log_prob[a];
-        gap += prob[a] * (log_prob[a] - first[a]);
-        store(log_prob[a], of.log_prob + batch.number(part, a), batch.count);
-        store(prob[a], of.prob + batch.number(part, a), batch.count);
-    }
-    store(entropy, of.entropy + batch.row(part, of.parts), batch.count);
-    store(gap, of.gap + batch.row(part, of.parts), batch.count);
-}
-
 // The slope of the clipped objective by the log-probability of what was done: rho A, or 0.
 Vec clipped(const Batch &batch, const Slope &slope, int64_t part, Vec log_prob) {
     const int64_t row = batch.row(0, 1), old = batch.row(slope.old_parts > 1 ? part : 0, slope.old_parts);
@@ -106,10 +87,7 @@ void back_part(const Batch &batch, const Slope &slope, int64_t part, const Vec *
     for (int64_t i = 0; learned && i < batch.count; i++) taken[i] = static_cast<int32_t>(slope.action[row + i]);
     Vec total = {}, by_log_prob = {};
     for (int64_t a = 0; a < of.actions; a++) by_log_prob = taken == static_cast<int32_t>(a) ? log_prob[a] : by_log_prob;
-    if (learned && slope.by_log_prob)
-        by_log_prob = batch.read(slope.by_log_prob, batch.row(part, slope.learned));
-    else if (learned)
-        by_log_prob = clipped(batch, slope, part, by_log_prob);
+    if (learned) by_log_prob = clipped(batch, slope, part, by_log_prob);
     for (int64_t a = 0; a < of.actions; a++) {
         by[a] = Vec{};
         if (learned) by[a] -= log_prob[a] * prob[a] * entropies;
@@ -137,12 +115,14 @@ void back(const Batch &batch, const Slope &slope, Vec *room, float *by_outputs) 
 
 extern "C" {
 
-void choose(const Choices *choices) {
-    each_batch(*choices, 4 * choices->actions, [](const Batch &batch, Vec *room) {
+void gaps(const Choices *choices) {
+    each_batch(*choices, 4 * choices->actions, [](const Batch &batch, Vec *first) {
+        const int64_t actions = batch.of.actions;
         for (int64_t k = 0; k < batch.of.parts; k++) {
-            Vec *own = room + (k > 0) * 2 * batch.of.actions;
-            softmax(batch, k, own);
-            write(batch, k, room, own);
+            Vec *log_prob = first + (k > 0) * 2 * actions, gap = {};
+            softmax(batch, k, log_prob);
+            for (int64_t a = 0; a < actions; a++) gap += log_prob[actions + a] * (log_prob[a] - first[a]);
+            store(gap, batch.of.gaps + batch.row(k, batch.of.parts), batch.count);
         }
     });
 }

@@ -21,24 +21,23 @@ class _Mixer(ctypes.Structure):
 class CompiledMixer(CompiledPass):
     """A pass through hypernetwork and mixer to the team's values [S, B]; see `CompiledPass`.
 
-    `own` [S, B, N] are the agents' values, contiguous. The hypernetwork has two layers or more, whose outputs are W_1
-    [N M], b_1 [M], w_2 [M] and b_2 for a mixer of M = `width` hidden units. There is an `unmix` where `keep` asks.
+    The first input is `own` [S, B, N], the agents' values, contiguous. The hypernetwork has two layers or more, whose
+    outputs are W_1 [N M], b_1 [M], w_2 [M] and b_2 for a mixer of M = `width` hidden units.
     """
 
-    def __init__(
-        self, own: Tensor, inputs: Sequence[Tensor], parameters: Sequence[Tensor], width: int, keep: bool
-    ) -> None:
+    def __init__(self, width: int, inputs: Sequence[Tensor], parameters: Sequence[Tensor], keep: bool) -> None:
+        own, *inputs = inputs
         if own.shape[:2] != (inputs[0].shape[0], prod(inputs[0].shape[1:-1])):
             raise UserError(f"a mixer got values {list(own.shape)} for states {list(inputs[0].shape)}")
         self._own, self._by_own = own.detach(), torch.empty_like(own)
         self._mixer = _Mixer(own.shape[2], width, own.data_ptr())
         super().__init__(inputs, parameters, "relu", False, keep=keep)
 
-    def unmix(
+    def backward_to(
         self, grad: Tensor, learns: Sequence[bool], asked: Sequence[bool]
-    ) -> tuple[Tensor, list[Tensor | None], list[Tensor | None]]:
-        """Return the gradients by the agents' values, by the parameters that learn and by the inputs that ask."""
-        return self._by_own, *self.backward_to(grad.contiguous(), learns, asked)
+    ) -> tuple[list[Tensor | None], list[Tensor | None]]:
+        grads, below = super().backward_to(grad.contiguous(), learns, asked[1:])
+        return grads, [self._by_own, *below]
 
     def _pull(self, grad: Tensor, found: Tensor | None, below: Below) -> None:
         call("mixer", "mix_backward", self._arguments, self._mixer, grad, found, below, self._by_own)

@@ -111,11 +111,7 @@ class _Plan:
         )  # fmt: skip
 
 
-@lru_cache(maxsize=256)
-def _plan(
-    inputs: tuple[Lies, ...], parameters: tuple[tuple[int, Lies], ...], activate_output: bool, **others: int
-) -> _Plan:
-    return _Plan(inputs, parameters, activate_output, **others)
+_plan = lru_cache(maxsize=256)(_Plan)
 
 
 class CompiledPass:
@@ -191,7 +187,6 @@ class CompiledPass:
         call("perceptron", "backward", self._arguments, RowsAt.of(grad), found, below)
 
     def _room(self, like: Tensor) -> Tensor:
-        """Return an empty buffer [S, P] for the gradients by all parameters."""
         return like.new_empty(self._size[0], self._plan.count)
 
     def _split(self, found: Tensor | None, learns: Sequence[bool]) -> list[Tensor | None]:

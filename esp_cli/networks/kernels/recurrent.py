@@ -24,13 +24,14 @@ class _Unit(ctypes.Structure):
 
 
 class CompiledUnroll:
-    """A run through whole episodes x [S, T, B, in] from empty memory; `memories` are [S, T, B, H] after every step.
+    """A run through whole episodes x [S, T, B, in] from empty memory; the outputs are the memories [S, T, B, H].
 
-    The parameters are W [S, in, 3H], its bias [S, 1, 3H], U [S, H, 3H] and its bias. To `keep` adds a `backward`.
+    The parameters are W [S, in, 3H], its bias [S, 1, 3H], U [S, H, 3H] and its bias. To `keep` adds a `backward_to`.
     """
 
     @torch.no_grad()
-    def __init__(self, x: Tensor, parameters: Sequence[Tensor], truncation: int, keep: bool) -> None:
+    def __init__(self, truncation: int, inputs: Sequence[Tensor], parameters: Sequence[Tensor], keep: bool) -> None:
+        (x,) = inputs
         x = x if x.stride(3) == 1 else x.contiguous()
         given = [p.detach() if p[0].is_contiguous() else p.detach().contiguous() for p in parameters]
         num_seeds, num_steps, num_rows, num_inputs = x.shape
@@ -55,10 +56,10 @@ class CompiledUnroll:
         )
         self._alive, self._shapes = (x, given, memories, gates), [p.shape[1:] for p in parameters]
         call("recurrent", "gru_forward", self._arguments)
-        self.memories = memories[..., :hidden]
+        self.outputs = memories[..., :hidden]
 
-    def backward(self, grad: Tensor) -> tuple[Tensor, list[Tensor]]:
-        """Return the gradients by x and by the parameters of what has this gradient by the memories."""
+    def backward_to(self, grad: Tensor, *_: Sequence[bool]) -> tuple[list[Tensor], list[Tensor]]:
+        """Return the gradients by all parameters and by x of what has this gradient by the memories."""
         x = self._alive[0]
         grad = grad if grad.stride(3) == 1 else grad.contiguous()
         sizes = [size.numel() for size in self._shapes]
@@ -66,4 +67,4 @@ class CompiledUnroll:
         strides = (ctypes.c_int64 * 3)(*grad.stride()[:3])
         call("recurrent", "gru_backward", self._arguments, grad, strides, found, by_x)
         parts = found.split(sizes, 1)
-        return by_x, [part.unflatten(1, size) for part, size in zip(parts, self._shapes, strict=True)]
+        return [part.unflatten(1, size) for part, size in zip(parts, self._shapes, strict=True)], [by_x]

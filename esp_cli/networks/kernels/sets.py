@@ -73,8 +73,6 @@ def _rows(things: Tensor | None) -> RowsAt:
 
 
 class _Pooled(torch.autograd.Function):
-    """`compiled_pool` under autograd."""
-
     @staticmethod
     def forward(ctx, activation, each, num_parts, *tensors):  # type: ignore[no-untyped-def]
         ctx.set_materialize_grads(False)

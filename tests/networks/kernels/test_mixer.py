@@ -39,10 +39,12 @@ def test_two_agents_and_two_units_by_hand():
     own = torch.tensor([[[2.0, 3.0]]])
     weights = torch.tensor([[[1.0, -1.0, -2.0, 0.0, 1.0, -3.0, -2.0, 3.0, -2.0]]])
     hidden = [torch.zeros(1, 4, 5), torch.ones(1, 1, 5)]  # units of the hypernetwork, whose last bias says the weights
-    run = CompiledMixer(own, [torch.randn(1, 1, 4)], [*hidden, torch.zeros(1, 5, 9), weights], 2, keep=True)
+    run = CompiledMixer(2, [own, torch.randn(1, 1, 4)], [*hidden, torch.zeros(1, 5, 9), weights], keep=True)
     below = math.exp(-1) - 1
     assert run.outputs.item() == pytest.approx(2 * 9 + 3 * below - 2, abs=1e-5)
-    by_own, (_, by_hidden, by_last, by_weights), _ = run.unmix(torch.tensor([[10.0]]), [True] * 4, [False])
+    (_, by_hidden, by_last, by_weights), (by_own, _) = run.backward_to(
+        torch.tensor([[10.0]]), [True] * 4, [True, False]
+    )
     first, second = 20.0, 30 * math.exp(-1)  # by the sums of both units
     assert by_own.flatten().tolist() == pytest.approx([first + second, 2 * first], abs=1e-3)
     by_hand = [2 * first, -2 * second, -3 * first, 0.0, first, second, -90.0, 10 * below, 10.0]
@@ -58,8 +60,8 @@ def test_a_seed_alone_and_any_number_of_threads_give_the_same_bits():
     parameters = [torch.randn(3, *size) for size in ((7, 16), (1, 16), (16, 5 * 20 + 1), (1, 5 * 20 + 1))]
 
     def found(seeds):
-        run = CompiledMixer(own[seeds], [state[seeds]], [p[seeds] for p in parameters], 20, keep=True)
-        by_own, grads, below = run.unmix(grad[seeds], [True] * 4, [True])
-        return [run.outputs, by_own, *grads, *below]
+        run = CompiledMixer(20, [own[seeds], state[seeds]], [p[seeds] for p in parameters], keep=True)
+        grads, below = run.backward_to(grad[seeds], [True] * 4, [True, True])
+        return [run.outputs, *grads, *below]
 
     assert_same_bits_alone_and_for_any_threads(found, 3)
