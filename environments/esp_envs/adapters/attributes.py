@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from esp_envs.adapters import foreign
-from esp_envs.adapters.hooks import Array, Copy
-from esp_envs.adapters.pairing import Attributes, Path
+from esp_envs.adapters.hooks import Copy
+from esp_envs.adapters.pairing import Array, Attributes, Path
 from esp_envs.spec import Field, Items, Layout, TaskSpec
 
 _TRIED = 16  # states that are set twice, to see whether the same follows

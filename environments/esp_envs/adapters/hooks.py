@@ -8,15 +8,12 @@ from contextlib import AbstractContextManager, suppress
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from esp_envs.adapters import foreign
-from esp_envs.adapters.pairing import Attributes, Simulator
+from esp_envs.adapters.pairing import Array, Attributes, Simulator
 from esp_envs.errors import UserError
 from esp_envs.roles import of_role
 from esp_envs.spec import ActionSpace, Discrete, Layout
-
-Array = NDArray[Any]
 
 
 class CopyHooks(ABC):

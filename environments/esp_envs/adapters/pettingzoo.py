@@ -17,7 +17,8 @@ from torch import Tensor
 from esp_envs.adapters import require_attributes, seed_of
 from esp_envs.adapters.attributes import deciding_attributes, simulated_layout
 from esp_envs.adapters.copies import FINAL, NOW, TERMINATED, TRUNCATED, Board, WorkerCopies
-from esp_envs.adapters.hooks import Array, Copy, CopyHooks
+from esp_envs.adapters.hooks import Copy, CopyHooks
+from esp_envs.adapters.pairing import Array
 from esp_envs.adapters.stepper import CopyStepper
 from esp_envs.base import Environment, Observation, Step, require_shape
 from esp_envs.errors import UserError

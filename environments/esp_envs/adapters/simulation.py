@@ -93,37 +93,37 @@ class RandomNumbers:
             self._state, shared[0] = shared[0], before
 
 
+_STATE = ("pos", "vel", "rot", "ang_vel")  # what an entity's state holds; anything else is a flag of the entity itself
+
+
 class Entities:
     """The entities of a simulator as the global state."""
 
     def __init__(self, sim: Any, own_goals: str, flags: Sequence[str], groups: Mapping[str, slice]) -> None:
         """Take the agents by role; the role "" is of a scenario without roles."""
         landmarks = sim.world.landmarks
-        goals = [i for i, entity in enumerate(landmarks) if own_goals and entity.name.startswith(own_goals)]
+        goals = [entity for entity in landmarks if own_goals and entity.name.startswith(own_goals)]
         if goals and len(goals) != len(sim.agents):
             raise UserError(
                 f"{len(goals)} landmarks are named '{own_goals}...' for {len(sim.agents)} agents; one belongs to each"
             )
-        rest = [i for i in range(len(landmarks)) if i not in goals]
-        self._columns: list[tuple[Field, int, list[int], str]] = []
+        rest = [entity for entity in landmarks if entity not in goals]
+        scripted = [agent for agent in sim.world.agents if agent not in sim.agents]
+        self._columns: list[tuple[Field, list[int], str]] = []  # and which of the world's entities, and what of them
         for role, where in groups.items():
-            own = list(range(len(sim.agents)))[where]
-            self._add(role or "agents", sim, _AGENTS, own, Items.FIXED if role else Items.AGENTS, role)
-        self._add("goals", sim, _LANDMARKS, goals, Items.AGENTS if "" in groups else Items.FIXED)
-        for i in rest:
-            self._add(landmarks[i].name.replace(" ", "_"), sim, _LANDMARKS, [i], Items.FIXED)
-        for i, agent in enumerate(_of(sim)[_SCRIPTED]):
-            self._add(agent.name.replace(" ", "_"), sim, _SCRIPTED, [i], Items.FIXED)
+            self._add(role or "agents", sim, sim.agents[where], Items.FIXED if role else Items.AGENTS, role)
+        self._add("goals", sim, goals, Items.AGENTS if "" in groups else Items.FIXED)
+        for entity in (*rest, *scripted):
+            self._add(entity.name.replace(" ", "_"), sim, [entity], Items.FIXED)
         for flag in flags:
-            held = [i for i in rest if hasattr(landmarks[i], flag)]
-            self._columns.append((Field(flag, Kind.SCALAR, len(held), "0 or 1"), _LANDMARKS, held, flag))
+            held = [sim.world.entities.index(entity) for entity in rest if hasattr(entity, flag)]
+            self._columns.append((Field(flag, Kind.SCALAR, len(held), "0 or 1"), held, flag))
         self.layout = Layout(tuple(field for field, *_ in self._columns))
 
     def read(self, sim: Any) -> Tensor:
         """Return the global state [E, state width]."""
-        parts, groups = [], _of(sim)
-        for _, group, index, what in self._columns:
-            entities = groups[group]
+        parts, entities = [], sim.world.entities
+        for _, index, what in self._columns:
             for i in index:
                 part = getattr(entities[i].state if what in _STATE else entities[i], what).float()
                 parts.append(torch.cat([part.cos(), part.sin()], -1) if what == "rot" else part.reshape(len(part), -1))
@@ -131,9 +131,8 @@ class Entities:
 
     def write(self, sim: Any, state: Tensor) -> None:
         """Put the entities into a global state [E, state width]."""
-        start, groups = 0, _of(sim)
-        for field, group, index, what in self._columns:
-            entities = groups[group]
+        start, entities = 0, sim.world.entities
+        for field, index, what in self._columns:
             for i in index:
                 part = state[:, start : start + field.item_width].clone()
                 start += field.item_width
@@ -145,10 +144,10 @@ class Entities:
                     flag = getattr(entities[i], what)
                     setattr(entities[i], what, part.view_as(flag).to(flag.dtype))
 
-    def _add(self, name: str, sim: Any, group: int, index: list[int], items: Items, family: str = "") -> None:
-        if not index:
+    def _add(self, name: str, sim: Any, entities: Sequence[Any], items: Items, family: str = "") -> None:
+        if not entities:
             return
-        first = _of(sim)[group][index[0]]
+        first, index = entities[0], [sim.world.entities.index(entity) for entity in entities]
         columns = [("pos", "position", Kind.VECTOR, "length")]
         if first.movable:
             columns.append(("vel", "velocity", Kind.VECTOR, "length/s"))
@@ -157,15 +156,4 @@ class Entities:
             columns.append(("ang_vel", "spin", Kind.PSEUDOSCALAR, "rad/s"))
         for what, word, kind, unit in columns:
             field = Field(f"{name}.{word}", kind, len(index), unit, items, family=family)
-            self._columns.append((field, group, index, what))
-
-
-_STATE = ("pos", "vel", "rot", "ang_vel")  # what an entity's state holds; anything else is a flag of the entity itself
-
-
-_AGENTS, _LANDMARKS, _SCRIPTED = 0, 1, 2
-
-
-def _of(sim: Any) -> tuple[Sequence[Any], ...]:
-    """Return the agents of a simulator, its landmarks, and agents that follow a script."""
-    return sim.agents, sim.world.landmarks, [agent for agent in sim.world.agents if agent not in sim.agents]
+            self._columns.append((field, index, what))

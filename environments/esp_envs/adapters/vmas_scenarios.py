@@ -20,6 +20,16 @@ from esp_envs.spec import Field, Items, Kind, Layout, layout
 _OWN = (Field("position", Kind.VECTOR, unit="length", is_point=True), Field("velocity", Kind.VECTOR, unit="length/s"))
 
 
+def _with_direction(place: int) -> Any:
+    """Return a `reading` that gives a line's angle, shown modulo pi, as cosine and sine of its double."""
+
+    def reading(_: VmasTask, obs: Tensor) -> Tensor:
+        double = 2 * obs[..., place : place + 1]
+        return torch.cat([obs[..., :place], double.cos(), double.sin(), obs[..., place + 1 :]], -1)
+
+    return reading
+
+
 class NavigationSettings(VmasSettings):
     """What a user may change of `Navigation`."""
 
@@ -42,11 +52,9 @@ class Navigation(VmasTask):
     convention = "vmas navigation: progress, 0.01 when all have arrived, -1 a collision"
     terminates = True
 
-    def __init__(self, *arguments: object) -> None:
-        settings = arguments[0]
-        assert isinstance(settings, NavigationSettings)
-        self.symmetry = f"d{settings.rays}*agents" if settings.rays else "o2*agents"
-        super().__init__(*arguments)  # type: ignore[arg-type]
+    @property
+    def symmetry(self) -> str:  # type: ignore[override]  # which follows from the settings
+        return f"d{self.settings.rays}*agents" if self.settings.rays else "o2*agents"
 
     def seen(self) -> Layout:
         rays = self.settings.rays
@@ -108,10 +116,7 @@ class Balance(VmasTask):
             Field("line_slope", Kind.PSEUDOSCALAR, unit="sin of twice the angle"),
         )
 
-    def reading(self, obs: Tensor) -> Tensor:
-        """Give the line's angle, which the scenario shows modulo pi, as cosine and sine of its double."""
-        double = 2 * obs[..., -1:]
-        return torch.cat([obs[..., :-1], double.cos(), double.sin()], -1)
+    reading = _with_direction(15)
 
 
 class DispersionSettings(VmasSettings):
@@ -179,12 +184,6 @@ def _scenario(
     return type(name.title().replace("_", ""), (VmasTask,), members | attributes)
 
 
-def _line_direction(_: VmasTask, obs: Tensor) -> Tensor:
-    """Give the wheel's angle, which it shows modulo pi, as cosine and sine of its double."""
-    double = 2 * obs[..., 10:11]
-    return torch.cat([obs[..., :10], double.cos(), double.sin(), obs[..., 11:]], -1)
-
-
 def _samples_around(_: VmasTask, obs: Tensor) -> Tensor:
     """Give the cells around an agent counter-clockwise from the right."""
     return torch.cat([obs[..., :16], obs[..., 16:][..., [0, 7, 2, 6, 1, 4, 3, 5]]], -1)
@@ -247,5 +246,5 @@ Sampling = _scenario(
     "sampling", "c1", *_OWN, *(Field(name, Kind.RING, rays=rays) for name, rays in (("lidar", 12), ("samples", 8))),
     agents=3, reading=_samples_around,
 )  # fmt: skip
-Wheel = _scenario("wheel", "c1", *_OWN, *_WHEEL, agents=4, reading=_line_direction)
+Wheel = _scenario("wheel", "c1", *_OWN, *_WHEEL, agents=4, reading=_with_direction(10))
 WindFlocking = _scenario("wind_flocking", "c1", *_OWN, agents=2, fixed=True)
