@@ -148,18 +148,13 @@ def open_policy(where: Path, algo: str | None = None, prior: str | None = None) 
     known = [*task_names(), *(entry.name for entry in bundled.read_bundled())]
     if name in known:
         entry = bundled.find(name, algo, prior)
-        trained = load_entry(entry)
+        trained = TrainedPolicy.read(bundled.bundled_folder() / entry.file, entry.sha256)
         note = f"{name}: taking the bundled policy {entry.name}"
         return trained if entry.name == name else replace(trained, notes=(*trained.notes, note))
     if chosen:
         raise UserError(f"--algo and --prior choose among a task's policies, but {where} is not a task; leave them out")
     hint = did_you_mean(name, known) or "; give a run folder, a policy file, or a task's or policy's name"
     raise UserError(f"{where} does not exist{hint}")
-
-
-def load_entry(entry: bundled.Entry) -> TrainedPolicy:
-    """Load a bundled policy; raises a UserError where its file is missing, or another than the manifest names."""
-    return TrainedPolicy.read(bundled.bundled_folder() / entry.file, entry.sha256)
 
 
 @dataclass(frozen=True)

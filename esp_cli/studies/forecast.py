@@ -59,11 +59,10 @@ def forecast_study(
     folder: StudyFolder, others: Sequence[StudyFolder], jobs: int, listener: Callable[[int], object]
 ) -> Forecast:
     """Measure what is left of a study, whose folder need not exist; runs that cost the same are measured once."""
-    known, runs, cells = dict[str, Cost](), list[RunForecast](), folder.study.cells
-    for k, cell in enumerate(cells):
+    known, runs, unlike = dict[str, Cost](), list[RunForecast](), folder.unlike(folder.study.cells)
+    for cell in folder.study.cells:
         config, step = cell.config, folder.progress(cell)[0]
-        done = folder.is_finished(cell) or folder.find_twin(cell, others) is not None
-        if done or (not step and any(config == earlier.config for earlier in cells[:k])):
+        if folder.is_finished(cell) or cell not in unlike or folder.find_twin(cell, others) is not None:
             runs.append(RunForecast(cell.name, "finished", config.steps, config.steps, len(config.seeds), 0))
         else:
             cost = _cost(config, folder.study.episodes, known)
