@@ -20,8 +20,7 @@ def paper_table(results: Results) -> Table:
     bare: dict[str, object] = {"status": "not run", "returns": {}, "summary": None, "convention": None}
     cells: list[CellResult] = []
     for panel, variant, key in paper_cells(results.kind):
-        number = paper.reported(key)
-        theirs = {"panel": panel, "variant": variant, "paper": number and (number.mean, number.sem)}
+        theirs = {"panel": panel, "variant": variant, "paper": paper.reported(key)}
         cells.append(
             ours.pop((panel, variant))
             if (panel, variant) in ours

@@ -56,19 +56,12 @@ def reproduce(
 
 
 def _forecast(benchmark: Benchmark, choices: StudyChoices) -> None:
-    from esp_cli.studies.forecast import forecast_tuned
-
-    out, request = choices.folder("symmetry"), benchmark.request
-    with studying.open_resources(choices, out, request.device) as resources:
-        jobs = resources.jobs
     pairs = {
         f"{name}: {method}": (benchmark.config(name, method, 0, True), benchmark.config(name, method, 0, False))
         for name, method in benchmark.taken
     }
-    with studying.measuring(len(pairs)) as listener:
-        title, counts = benchmark.title, (benchmark.budget, 1)
-        found = forecast_tuned(title, out, pairs, counts, request.episodes, jobs, listener)
-    studying.print_forecast(found, choices.json, f"{benchmark.budget} trials of each, and the run that judges it")
+    counts, what = (benchmark.budget, 1), f"{benchmark.budget} trials of each, and the run that judges it"
+    studying.forecast_tuned("symmetry", benchmark.title, pairs, counts, benchmark.request, choices, what)
 
 
 def _judge(benchmark: Benchmark, choices: StudyChoices) -> None:

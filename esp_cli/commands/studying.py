@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from esp_cli.studies.forecast import Forecast
     from esp_cli.studies.scheduler import Scheduler, Snapshot
     from esp_cli.studies.study import Study, StudyFolder
+    from esp_cli.training.config import RunConfig
 
 
 @dataclass(frozen=True)
@@ -118,19 +119,33 @@ def forecast_study(kind: str, request: Request, choices: StudyChoices) -> None:
     note_without_effect(without_effect(kind, request))
     with open_resources(choices, out, study.cells[0].config.device) as resources:
         StudyFolder.planned(out, study)  # refuses the folders that the run would refuse
-        with measuring(len(study.cells)) as listener:
-            found = forecast.forecast_study(StudyFolder(out, study), resources.reused, resources.jobs, listener)
-    print_forecast(found, choices.json, f"{sum(run.status != 'finished' for run in found.runs)} runs to do")
+        with console.TrainingProgress(len(study.cells), description="measure", unit="runs") as progress:
+            folder = StudyFolder(out, study)
+            found = forecast.forecast_study(folder, resources.reused, resources.jobs, progress.update)
+    _print_forecast(found, choices.json, f"{sum(run.status != 'finished' for run in found.runs)} runs to do")
 
 
-@contextmanager
-def measuring(total: int) -> Iterator[Callable[[int], object]]:
-    """Yield a progress callback."""
-    with console.TrainingProgress(total, description="measure", unit="runs") as progress:
-        yield progress.update
+def forecast_tuned(
+    kind: str,
+    title: str,
+    pairs: Mapping[str, tuple[RunConfig, RunConfig]],
+    counts: tuple[int, int],
+    request: Request,
+    choices: StudyChoices,
+    what: str,
+) -> None:
+    """Say `what` runs cost that are tuned and judged, in pairs and counts as of `studies.forecast.forecast_tuned`."""
+    from esp_cli.studies import forecast
+
+    out = choices.folder(kind)
+    with open_resources(choices, out, request.device) as resources:
+        jobs = resources.jobs
+    with console.TrainingProgress(len(pairs), description="measure", unit="runs") as progress:
+        found = forecast.forecast_tuned(title, out, pairs, counts, request.episodes, jobs, progress.update)
+    _print_forecast(found, choices.json, what)
 
 
-def print_forecast(found: Forecast, json: str | None, what: str) -> None:
+def _print_forecast(found: Forecast, json: str | None, what: str) -> None:
     """Print `what` is left to do, such as "2 runs to do" and how long it takes."""
     rows = [
         (

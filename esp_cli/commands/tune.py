@@ -62,20 +62,16 @@ def tune(
 
 def _tuning(request: Request, priors: Sequence[str], space: Path | None, trial_seeds: int, budget: int) -> Tuning:
     from esp_cli.algorithms.presets import ALGORITHMS
-    from esp_cli.studies.catalogue import task_setting
+    from esp_cli.studies.catalogue import refuse_other_tasks, refuse_unknown_or_twice, task_setting
     from esp_cli.studies.tuning import NAMES, Tuning
     from esp_cli.studies.tuning_space import default_space, read_space
 
     for flag, names in (("--task", request.tasks), ("--algo", request.algorithms), ("--steps", request.steps)):
         if names is not None and len(names) != 1:
             raise UserError(f"esp tune takes one {flag}, not {len(names)}; run it once for each")
-    for name in priors:
-        if name not in NAMES or priors.count(name) > 1:
-            raise UserError(f"--prior names each kind once; they are {', '.join(NAMES)}")
+    refuse_unknown_or_twice("kind of prior", priors, NAMES)
     task, algorithm = (request.tasks or ("navigation",))[0], (request.algorithms or ("mappo",))[0]
-    meant, steps = (request.steps or ((None, 500_000),))[0]
-    if meant not in (None, task):
-        raise UserError(f"--steps {meant}={steps} concerns no run of this tuning; its task is {task}")
+    refuse_other_tasks(request.steps or (), (task,))
     ALGORITHMS[algorithm]  # refuses an unknown algorithm before the space that it lacks
     tried_settings = read_space(space) if space else default_space(algorithm)
     tuning = Tuning(
@@ -84,7 +80,7 @@ def _tuning(request: Request, priors: Sequence[str], space: Path | None, trial_s
         preset=request.preset,
         priors=tuple(priors),
         budget=budget,
-        steps=steps,
+        steps=request.steps[0][1] if request.steps else 500_000,
         trial_seeds=tuple(range(FIRST_TRIAL_SEED, FIRST_TRIAL_SEED + trial_seeds)),
         overrides={task_setting(name, task): value for name, value in request.overrides.items()},
         space={task_setting(name, task): tried for name, tried in tried_settings.items()},
@@ -97,16 +93,12 @@ def _tuning(request: Request, priors: Sequence[str], space: Path | None, trial_s
 
 
 def _forecast(tuning: Tuning, request: Request, choices: StudyChoices) -> None:
-    from esp_cli.studies.forecast import forecast_search
-
-    out = choices.folder("tune")
-    with studying.open_resources(choices, out, tuning.device) as resources:
-        jobs = resources.jobs
-    with studying.measuring(len(tuning.priors)) as listener:
-        found = forecast_search(tuning, out, request.seeds, request.episodes, jobs, listener)
-    studying.print_forecast(
-        found, choices.json, "all trials with the default settings, of which pruning saves about half"
-    )
+    pairs = {
+        f"{tuning.budget} trials, prior {prior}": (tuning.config(prior, {}), tuning.config(prior, {}, request.seeds))
+        for prior in tuning.priors
+    }
+    what = "all trials with the default settings, of which pruning saves about half"
+    studying.forecast_tuned("tune", tuning.title, pairs, (tuning.budget, 2), request, choices, what)
 
 
 def _tune(tuning: Tuning, request: Request, choices: StudyChoices) -> None:

@@ -97,7 +97,7 @@ class TrainedPolicy:
             )
         if spec.observation == self.spec.observation and not numbers:
             return replace(self, config=config, spec=spec)
-        policy = _untrained(config, spec, _at_default(config.network, "compiled")).to(config.device)
+        policy = _untrained(config, spec).to(config.device)
         policy.load_state_dict(self.policy.state_dict())
         return replace(self, config=config, spec=spec, policy=policy)
 
@@ -125,7 +125,7 @@ class TrainedPolicy:
         network = _at_default(self.config.network, "precision", "compiled")
         choice = {"seeds": seeds[index : index + 1], "network": network, "device": "cpu"}
         config = self.config.model_copy(update=choice)
-        policy = _untrained(config, self.spec, network)
+        policy = _untrained(config, self.spec)
         policy.load_state_dict({name: t[index : index + 1].cpu() for name, t in self.policy.state_dict().items()})
         return replace(self, config=config, policy=policy, stopped=(0,) if index in self.stopped else ())
 
@@ -148,18 +148,13 @@ def open_policy(where: Path, algo: str | None = None, prior: str | None = None) 
     known = [*task_names(), *(entry.name for entry in bundled.read_bundled())]
     if name in known:
         entry = bundled.find(name, algo, prior)
-        trained = load_entry(entry)
+        trained = TrainedPolicy.read(bundled.bundled_folder() / entry.file, entry.sha256)
         note = f"{name}: taking the bundled policy {entry.name}"
         return trained if entry.name == name else replace(trained, notes=(*trained.notes, note))
     if chosen:
         raise UserError(f"--algo and --prior choose among a task's policies, but {where} is not a task; leave them out")
     hint = did_you_mean(name, known) or "; give a run folder, a policy file, or a task's or policy's name"
     raise UserError(f"{where} does not exist{hint}")
-
-
-def load_entry(entry: bundled.Entry) -> TrainedPolicy:
-    """Load a bundled policy; raises a UserError where its file is missing, or another than the manifest names."""
-    return TrainedPolicy.read(bundled.bundled_folder() / entry.file, entry.sha256)
 
 
 @dataclass(frozen=True)
@@ -202,7 +197,8 @@ class Start:
                     f"with the network {self.config.network.name}, and {of_it} but {of_this} in this run; "
                     f"choose {algorithm}the task settings and the network of that policy"
                 )
-        weights = _repeated({**given, **fitting}, seeds)
+        every = {**given, **fitting}
+        weights = {name: t.cpu().expand(seeds, *t.shape[1:]).contiguous() for name, t in every.items()}
         return InitialPolicy(source=self.source, sha256=digest(weights, {})), weights
 
     @property
@@ -210,11 +206,8 @@ class Start:
         return len(next(iter(self.weights.values())))
 
 
-def _repeated(weights: Mapping[str, Tensor], seeds: int) -> dict[str, Tensor]:
-    return {name: t.cpu().expand(seeds, *t.shape[1:]).contiguous() for name, t in weights.items()}
-
-
-def _untrained(config: RunConfig, spec: TaskSpec, network: NetworkConfig) -> Policy:
+def _untrained(config: RunConfig, spec: TaskSpec) -> Policy:
+    network = _at_default(config.network, "compiled")  # using a policy needs no compiler
     return new_policy(ALGORITHMS[config.algorithm], spec, network, generators(config.seeds, "shape")).eval()
 
 
@@ -246,8 +239,7 @@ def _build(
     needed = len(config.seeds) * config.network.least_parameters(spec.observation.width)
     if needed > sum(tensor.numel() for tensor in tensors.values()):
         raise UserError(f"{misfit} (hidden widths {config.network.hidden})")
-    network = _at_default(config.network, "compiled")  # using a policy needs no compiler
-    policy = _untrained(config, spec, network).to(config.device)
+    policy = _untrained(config, spec).to(config.device)
     _fill(policy, tensors, path, misfit)
     if stopped := _stopped(meta, len(config.seeds)):
         seeds = ", ".join(str(config.seeds[k]) for k in stopped)

@@ -19,6 +19,7 @@ from esp_cli.policies.evaluation import FinalEvaluation
 from esp_cli.policies.statistics import area_under_curve, steps_to_threshold, summarise
 from esp_cli.reporting.results import CellResult, Results, returns_of, summarised
 from esp_cli.studies.kinds import kind_of
+from esp_cli.studies.paper import reported
 from esp_cli.studies.run_set import Cell
 from esp_cli.studies.study import Study, StudyFolder, read_evaluation
 from esp_cli.training.build import spec_of
@@ -188,7 +189,6 @@ def _alike(curves: Sequence[RunCurve], step: int) -> bool:
 
 
 def _evaluated(curves: Sequence[RunCurve]) -> str:
-    """State at which steps runs were evaluated."""
     steps = {c.label: [format_exactly(int(step)) for step in c.steps] for c in curves}
     few = {label: own if len(own) <= 4 else [*own[:2], "...", own[-1]] for label, own in steps.items()}
     return "; ".join(f"{label} at {', '.join(own)}" for label, own in few.items())
@@ -228,21 +228,15 @@ def _results(study: Study, states: Mapping[str, _State], mode: Mode, thresholds:
     configs = {cell.name: dict(flat(cell.config.model_dump(mode="json"))) for cell in study.cells}
     first = next(iter(configs.values()))
     shared = {key: value for key, value in first.items() if all(c.get(key, ...) == value for c in configs.values())}
-    cells = []
-    for cell in study.cells:
-        own = {key: value for key, value in configs[cell.name].items() if key not in shared}
-        cells.append(_cell(study, cell, states[cell.name], mode).model_copy(update={"config": own}))
-    same = {
-        name: getattr(study, name)
-        for name in ("kind", "title", "command", "esp_version", "rows", "episodes", "left_out")
-    }
-    results = Results(**same, mode=mode, config=shared, cells=tuple(cells))
+    own = {name: {key: config[key] for key in config if key not in shared} for name, config in configs.items()}
+    cells = tuple(_cell(study, cell, states[cell.name], mode, own[cell.name]) for cell in study.cells)
+    results = Results(**study.model_dump(exclude={"cells"}), mode=mode, config=shared, cells=cells)
     timed = tuple(_timed(results, cell, states[cell.name].curve, thresholds) for cell in cells)
     return summarised(results.model_copy(update={"cells": timed}))
 
 
-def _cell(study: Study, cell: Cell, state: _State, mode: Mode) -> CellResult:
-    curve, number, kind, final = state.curve, cell.reported, kind_of(study.kind), state.final
+def _cell(study: Study, cell: Cell, state: _State, mode: Mode, config: Mapping[str, Any]) -> CellResult:
+    curve, kind, final = state.curve, kind_of(study.kind), state.final
     compared = curve.until(state.at) if curve is not None and state.at is not None else curve
     fields: dict[str, Any] = {}
     if final is not None:
@@ -273,10 +267,9 @@ def _cell(study: Study, cell: Cell, state: _State, mode: Mode) -> CellResult:
         fields["seconds"] = round(curve.seconds, 1)
         if (kind.breakings or kind.benchmark) and (early := curve.until(cell.config.steps // 5)):
             fields["early"] = _rounded(early.values[-1])
-    same = {name: getattr(cell, name) for name in ("name", "panel", "variant", "reference")}
+    fields |= cell.model_dump(exclude={"config"}) | {"paper": reported(cell.paper), "status": status, "config": config}
     fields |= {"step": state.step, "at": state.at, "steps": cell.config.steps, "seeds": cell.config.seeds}
-    paper = None if number is None else (number.mean, number.sem)
-    return CellResult(**same, **fields, paper=paper, status=status, config={})
+    return CellResult(**fields)
 
 
 def _timed(results: Results, cell: CellResult, curve: RunCurve | None, thresholds: Sequence[float]) -> CellResult:

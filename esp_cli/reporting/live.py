@@ -6,19 +6,18 @@ import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from esp_cli.drawing.draw import Request, draw
 from esp_cli.files.formatting import format_count
 from esp_cli.files.writing import replace_file
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.reporting.collect import read_curve
-from esp_cli.reporting.page import data_uri, film_speed, template
+from esp_cli.reporting.page import data_uri, draw_film, template
 from esp_cli.reporting.study_figures import Panel, learning_curves
 from esp_cli.training.trackers import Row
 from esp_cli.training.trainer import Trainer
 
 LIVE = "live.html"
 SHARE = 0.1  # most of a run's time that drawing takes
-_REFRESH_S, _FILM_PIXELS, _FILM_FRAMES_PER_SECOND = 5, 320, 12.0
+_REFRESH_S, _FILM_PIXELS = 5, 320
 
 
 class LivePage:
@@ -46,12 +45,9 @@ class LivePage:
             ylabel = f"greedy return ({spec.convention})"
             picture = learning_curves([Panel(spec.name, [curve])], Path(scratch) / "curve", ylabel)
             svg = picture.svg.read_bytes()
-            if trainer.evaluation_worlds.has("scene"):
-                drawn = Path(scratch) / "film.gif"
-                trained = TrainedPolicy(config, trainer.learner.policy, spec, step, trainer.folder.path)
-                speed, rate = film_speed(spec), _FILM_FRAMES_PER_SECOND
-                draw(Request(drawn, episodes=1, view="top", size=_FILM_PIXELS, speed=speed, fps=rate), [trained])
-                film = drawn.read_bytes()
+        if trainer.evaluation_worlds.has("scene"):
+            trained = TrainedPolicy(config, trainer.learner.policy, spec, step, trainer.folder.path)
+            film = draw_film(trained, _FILM_PIXELS, episodes=1)
         return template("live.html").render(
             title=f"{config.algorithm} on {config.task}, {format_count(done)} of {format_count(config.steps)} steps",
             refresh=None if complete else _REFRESH_S,

@@ -32,7 +32,6 @@ from esp_cli.reporting.tables import all_tables, markdown_text
 from esp_cli.studies.kinds import kind_of
 from esp_cli.training.folder_names import POLICY
 from esp_envs.errors import UserError
-from esp_envs.spec import TaskSpec
 
 PAGE, MARKDOWN, RESULTS, FILM = "report.html", "report.md", "results.json", "film.gif"
 CURVES = "curves"
@@ -56,17 +55,12 @@ def write_report(material: Material, out: Path, style: Style = "screen") -> list
         for file in sorted(Path(scratch).iterdir()):
             replace_file(out / file.name, file.read_bytes())
     tables, study = all_tables(material.results), material.study
-    whole = {material.runs.get(cell.name, cell.name): cell for cell in study.cells}  # each run once
+    named = {material.runs[cell.name]: (f"{cell.panel}: {cell.variant}", cell.config) for cell in study.cells}
     runs = [
-        {
-            "name": f"{cell.panel}: {cell.variant}",
-            "command": cell.config.command(),
-            "config": json.dumps(cell.config.model_dump(mode="json"), indent=1),
-        }
-        for cell in whole.values()
+        {"name": name, "command": config.command(), "config": json.dumps(config.model_dump(mode="json"), indent=1)}
+        for name, config in named.values()
     ]
-    titles = {material.runs[cell.name]: f"{cell.panel}: {cell.variant}" for cell in study.cells}
-    films = [(title, data_uri(film, "image/gif")) for run, title in titles.items() if (film := _film(run / FILM))]
+    films = [(name, data_uri(film, "image/gif")) for run, (name, _) in named.items() if (film := _film(run / FILM))]
     content = {
         "title": study.title,
         "version": __version__,
@@ -98,18 +92,18 @@ def draw_films(runs: Mapping[str, Path], watch: Callable[[int], None]) -> None:
     """Draw the policy of each trained run that has no film yet, into its folder; tell `watch` how many are done."""
     for count, run in enumerate(runs.values(), start=1):
         if (run / POLICY).is_file() and not _film(run / FILM):
-            trained = TrainedPolicy.read(run / POLICY)
-            speed = film_speed(trained.spec)
-            with TemporaryDirectory() as scratch:
-                film = Path(scratch) / FILM
-                draw(Request(film, view="top", size=_FILM_PIXELS, speed=speed, fps=_FILM_FRAMES_PER_SECOND), [trained])
-                replace_file(run / FILM, film.read_bytes())
+            replace_file(run / FILM, draw_film(TrainedPolicy.read(run / POLICY), _FILM_PIXELS))
         watch(count)
 
 
-def film_speed(spec: TaskSpec) -> float:
-    """Return the speed, times real time, at which an episode of a task takes no longer than a page's film may."""
-    return max(1.0, spec.horizon * spec.control_period_s / _FILM_SECONDS)
+def draw_film(trained: TrainedPolicy, size: int, episodes: int | None = None) -> bytes:
+    """Draw a GIF of a policy for a page, so many pixels large; an episode takes no longer than a page's film may."""
+    speed = max(1.0, trained.spec.horizon * trained.spec.control_period_s / _FILM_SECONDS)
+    with TemporaryDirectory() as scratch:
+        film = Path(scratch) / FILM
+        request = Request(film, episodes=episodes, view="top", size=size, speed=speed, fps=_FILM_FRAMES_PER_SECOND)
+        draw(request, [trained])
+        return film.read_bytes()
 
 
 def template(name: str) -> Template:
@@ -128,11 +122,10 @@ def _refuse_foreign(out: Path) -> None:
 
 def _film(path: Path) -> bytes:
     """Return a film that was drawn before; empty where there is none. A link is not followed."""
-    content = None
-    if not path.is_symlink():
-        with contextlib.suppress(OSError):
-            content = read_regular(path, _MAX_FILM_BYTES)
-    return content if content and content.startswith(b"GIF8") else b""
+    with contextlib.suppress(OSError):
+        if not path.is_symlink() and (content := read_regular(path, _MAX_FILM_BYTES) or b"").startswith(b"GIF8"):
+            return content
+    return b""
 
 
 def data_uri(content: bytes, kind: str) -> str:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Collection, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 
 from esp_cli.algorithms.presets import ALGORITHMS, SETS
 from esp_cli.checking.measured import planned
@@ -68,15 +69,27 @@ def without_effect(name: str, request: Request) -> list[str]:
 
 def _cells(kind: StudyKind, request: Request) -> tuple[Cell, ...]:
     variants = tuple(kind.variants) if request.variants is None else tuple(request.variants)
-    unknown = next((name for name in variants if name not in kind.variants), None)
-    if unknown is not None or not variants or len(set(variants)) < len(variants):
-        fault = "name each variant of this study once" if unknown is None else f"this study has no variant '{unknown}'"
-        raise UserError(f"{fault}; they are {', '.join(map(repr, kind.variants))}")
+    refuse_unknown_or_twice("variant of this study", variants, kind.variants)
     tasks, algorithms = tuple(request.tasks or kind.tasks), tuple(request.algorithms or kind.algorithms)
     refuse_varied(request.overrides, tasks, kind.varies)
     _refuse_unused(kind, request, tasks, algorithms)
     build = _pairs if kind.rows == "panels" else _variants
     return tuple(cell for task in tasks for cell in build(kind, task, algorithms, variants, request))
+
+
+def refuse_unknown_or_twice(noun: str, names: Sequence[str], known: Collection[str]) -> None:
+    """Refuse a name that is not known, or that stands twice."""
+    for name in names:
+        if name not in known or names.count(name) > 1:
+            fault = "is named twice" if name in known else f"is no {noun}"
+            raise UserError(f"'{name}' {fault}; name each once: {', '.join(map(repr, dict.fromkeys(known)))}")
+
+
+def refuse_other_tasks(steps: Iterable[tuple[str | None, int]], tasks: Collection[str]) -> None:
+    """Refuse numbers of steps for tasks of which there is no run."""
+    for task, number in steps:
+        if task is not None and task not in tasks:
+            raise UserError(f"--steps {task}={number} concerns no run here; the tasks are {', '.join(tasks)}")
 
 
 def refuse_varied(settings: Iterable[str], tasks: Sequence[str], varied: Container[str]) -> None:
@@ -90,9 +103,7 @@ def _pairs(
     kind: StudyKind, task: str, algorithms: Sequence[str], variants: Sequence[str], request: Request
 ) -> Iterator[Cell]:
     teams = kind.teams or (Team(task, {}, ("table1", task)),)
-    for team, steps, algorithm in (
-        (team, steps, algorithm) for team in teams for steps in _steps(kind, task, request) for algorithm in algorithms
-    ):
+    for team, steps, algorithm in product(teams, _steps(kind, task, request), algorithms):
         stem = f"{file_name(team.label)}-{format_exactly(steps)}-{file_name(algorithm)}"
         for prior in variants:
             config = _config(kind, task, algorithm, steps, request, {**team.settings, **kind.variants[prior]})
@@ -113,9 +124,7 @@ def _variants(
     for setting, values in kind.breakings.get(task, {}).items():
         if request.breakings is None or setting in request.breakings:
             strengths += [Team(f"{setting} {value:g}", {f"task.{setting}": value}, ()) for value in values]
-    for strength, algorithm, steps in (
-        (team, a, s) for team in strengths for a in algorithms for s in _steps(kind, task, request)
-    ):
+    for strength, algorithm, steps in product(strengths, algorithms, _steps(kind, task, request)):
         heads = [part for part in (task, strength.label) if part]
         stem = "-".join(file_name(part) for part in (*heads, algorithm)) + f"-{format_exactly(steps)}"
         for variant in variants:
@@ -144,7 +153,6 @@ def task_setting(name: str, task: str) -> str:
 
 
 def _steps(kind: StudyKind, task: str, request: Request) -> tuple[int, ...]:
-    """Return the numbers of steps of a task."""
     rows, names = paper.horizons(task), paper.horizons("navigation")
     if request.steps is None:
         return kind.steps or ((rows or names) if kind.all_rows else (rows or names)[:1])
@@ -159,11 +167,13 @@ def _config(kind: StudyKind, task: str, algorithm: str, steps: int, request: Req
     settings = dict(kind.common)
     if kind.papers_network and request.preset != "paper" and task in SETS.get(algorithm, {}):
         settings["network.name"] = "mlp"
-    for name, value in request.overrides.items():
-        if concerns(name, task, algorithm):
-            settings[task_setting(name, task)] = value
-    settings |= choice
+    settings |= {**settings_of(request.overrides, task, algorithm), **choice}
     return resolve_config(task, algorithm, request.preset, steps, request.seeds, request.device, settings)
+
+
+def settings_of(settings: Settings, task: str, algorithm: str) -> dict[str, object]:
+    """Return those settings that concern runs of this task and algorithm, as these call them."""
+    return {task_setting(name, task): value for name, value in settings.items() if concerns(name, task, algorithm)}
 
 
 def concerns(name: str, task: str, algorithm: str) -> bool:
@@ -196,16 +206,12 @@ def _refuse_unused(kind: StudyKind, request: Request, tasks: Sequence[str], algo
         section = name.rpartition(".")[0]
         if section in (*ALGORITHMS, *task_names()) and section not in (*tasks, *algorithms):
             raise UserError(f"--set {name} concerns no run of this study; it has {', '.join((*tasks, *algorithms))}")
-    for task, steps in request.steps or ():
-        if task is not None and task not in tasks:
-            raise UserError(f"--steps {task}={steps} concerns no run of this study; its tasks are {', '.join(tasks)}")
+    refuse_other_tasks(request.steps or (), tasks)
     unserved = [task for task in tasks if not _steps(kind, task, request)]
     if unserved:
         raise UserError(f"--steps says nothing about {unserved[0]}; add a number of steps for all tasks, or for it")
-    for given, noun in ((tasks, "task"), (algorithms, "algorithm")):
-        twice = {name for name in given if given.count(name) > 1}
-        if twice:
-            raise UserError(f"the {noun} {twice.pop()} is named twice; name it once")
+    refuse_unknown_or_twice("task", tasks, tasks)
+    refuse_unknown_or_twice("algorithm", algorithms, algorithms)
 
 
 def _paired_name(algorithm: str, prior: str) -> str:

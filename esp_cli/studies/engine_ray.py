@@ -26,7 +26,7 @@ from esp_cli.defaults import __version__
 from esp_cli.files.documents import DocumentFormat
 from esp_cli.files.formatting import sentence
 from esp_cli.files.opening import is_held
-from esp_cli.studies.engine import Job, LocalEngine
+from esp_cli.studies.engine import LocalEngine
 from esp_cli.training.build import process_bytes, spec_of
 from esp_cli.training.folder_names import LOCK
 from esp_cli.training.run_folder import RunFolder
@@ -44,11 +44,7 @@ _RAY_ENVIRONMENT = {"RAY_AUTH_MODE": "token", "RAY_USAGE_STATS_ENABLED": "0", "R
 _JOB_ENVIRONMENT = ("ESP_CHECKPOINT_SECONDS", "ESP_TRACEBACK")  # handed on from the driver to the jobs
 
 
-class ClusterError(UserError):
-    """The cluster cannot be used; the text is one sentence for the user."""
-
-
-CLUSTER_FORMAT = DocumentFormat("esp-cluster", 1, "what a driver tells the nodes of a cluster", ClusterError)
+CLUSTER_FORMAT = DocumentFormat("esp-cluster", 1, "what a driver tells the nodes of a cluster")
 
 
 class RayEngine:
@@ -82,9 +78,9 @@ class RayEngine:
             "versions": dict(versions()),
             "environment": {name: os.environ[name] for name in _JOB_ENVIRONMENT if name in os.environ},
         }
-        CLUSTER_FORMAT.write(self.folder / "cluster.json", told)
-        task = ray.remote(run_job).options(num_cpus=1, num_gpus=gpus, memory=memory, max_retries=MAX_RETRIES)
         file = self.folder.absolute() / "cluster.json"
+        CLUSTER_FORMAT.write(file, told)
+        task = ray.remote(run_job).options(num_cpus=1, num_gpus=gpus, memory=memory, max_retries=MAX_RETRIES)
         return RayJob(task.remote(tuple(arguments), log.absolute(), file, self._identity), log.parent)
 
 
@@ -108,7 +104,6 @@ class RayJob:
         return self._code
 
     def ask_to_stop(self) -> None:
-        """Ask the job to end after its iteration, with a checkpoint."""
         ray.cancel(self._result)
 
     def kill(self) -> None:
@@ -116,7 +111,6 @@ class RayJob:
         ray.cancel(self._result, force=True)
 
     def last_words(self) -> str:
-        """Return why the job failed: its last error message, or its last line."""
         return self._words
 
 
@@ -126,7 +120,7 @@ def run_job(arguments: Sequence[str], log: Path, cluster: Path, identity: str) -
     try:
         told = CLUSTER_FORMAT.read(cluster) if cluster.is_file() else {}
         if told.get("identity") != identity:
-            raise ClusterError(
+            raise UserError(
                 f"the node {node} does not see {cluster.parent} of this machine; put the study on a file system that "
                 "all nodes share"
             )
@@ -140,20 +134,14 @@ def run_job(arguments: Sequence[str], log: Path, cluster: Path, identity: str) -
         return 1, f"{sentence(error)} (on the node {node})"
     except UserError as error:
         return 2, str(error)
-    while (code := _waited(job)) is None:
-        pass
+    code: int | None = None
+    while code is None:
+        try:
+            while (code := job.poll()) is None:
+                time.sleep(POLL_S)
+        except KeyboardInterrupt:
+            job.ask_to_stop()
     return code, f"{job.last_words()} (on the node {node})" if code else ""
-
-
-def _waited(job: Job) -> int | None:
-    """Return the exit code of a job that has ended, or None where it was asked to stop meanwhile."""
-    try:
-        while (code := job.poll()) is None:
-            time.sleep(POLL_S)
-        return code
-    except KeyboardInterrupt:
-        job.ask_to_stop()
-        return None
 
 
 def refuse_what_no_node_has(needed: Mapping[str, float], name: str, nodes: Sequence[Mapping[str, float]]) -> None:
@@ -164,7 +152,7 @@ def refuse_what_no_node_has(needed: Mapping[str, float], name: str, nodes: Seque
     # a run of fewer seeds needs less memory, and nothing else
     fewer = any(all(node.get(kind, 0.0) >= needed[kind] for kind in ("CPU", "GPU")) for node in nodes)
     advice = "add one, or use fewer seeds" if fewer else "add one"
-    raise ClusterError(f"no node of the cluster offers what {name} needs ({asked}); {advice}")
+    raise UserError(f"no node of the cluster offers what {name} needs ({asked}); {advice}")
 
 
 @cache
@@ -184,7 +172,7 @@ def refuse_difference(node: str, theirs: Mapping[str, str], ours: Mapping[str, s
     if unlike:
         there = ", ".join(f"{name} {theirs.get(name, 'missing')}" for name in unlike)
         here = ", ".join(ours[name] for name in unlike)
-        raise ClusterError(f"the node {node} has {there}, but the driver has {here}; install the same versions on both")
+        raise UserError(f"the node {node} has {there}, but the driver has {here}; install the same versions on both")
 
 
 def _connect(address: str | None) -> None:
@@ -206,7 +194,7 @@ def _connect(address: str | None) -> None:
         ray.init(**choice)
     except (OSError, RuntimeError, ValueError, RayError) as error:
         reason = str(error).strip().splitlines()[0]
-        raise ClusterError(
+        raise UserError(
             f"cannot use the Ray cluster at {address or 'RAY_ADDRESS'} ({reason}); check --address, "
             "RAY_AUTH_MODE, and that the nodes have the same versions of Ray and Python"
         ) from None

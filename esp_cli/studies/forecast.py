@@ -13,7 +13,6 @@ import torch
 
 from esp_cli.studies.scheduler import Status, makespan
 from esp_cli.studies.study import StudyFolder
-from esp_cli.studies.tuning import Tuning
 from esp_cli.training.build import PolicyController, build_environment, build_learner, generators, play
 from esp_cli.training.config import RunConfig
 from esp_envs.registry import task_class
@@ -60,31 +59,18 @@ def forecast_study(
     folder: StudyFolder, others: Sequence[StudyFolder], jobs: int, listener: Callable[[int], object]
 ) -> Forecast:
     """Measure what is left of a study, whose folder need not exist; runs that cost the same are measured once."""
-    known, runs, cells = dict[str, Cost](), list[RunForecast](), folder.study.cells
-    for k, cell in enumerate(cells):
+    known, runs, unlike = dict[str, Cost](), list[RunForecast](), folder.unlike(folder.study.cells)
+    for cell in folder.study.cells:
         config, step = cell.config, folder.progress(cell)[0]
-        done = folder.is_finished(cell) or folder.find_twin(cell, others) is not None
-        if done or (not step and any(config == earlier.config for earlier in cells[:k])):
+        if folder.is_finished(cell) or cell not in unlike or folder.find_twin(cell, others) is not None:
             runs.append(RunForecast(cell.name, "finished", config.steps, config.steps, len(config.seeds), 0))
         else:
             cost = _cost(config, folder.study.episodes, known)
             left = cost.training_s * (1 - step / config.steps) + cost.evaluation_s
             runs.append(RunForecast(cell.name, "waiting", config.steps, step, len(config.seeds), left))
         listener(len(runs))
-    seconds = makespan([], [run.seconds for run in runs if run.status != "finished"], jobs)
-    return _added_up(folder.study.title, folder.path, jobs, seconds, runs)
-
-
-def forecast_search(
-    tuning: Tuning, out: Path, seeds: Sequence[int], episodes: int, jobs: int, listener: Callable[[int], object]
-) -> Forecast:
-    """Measure what a search costs where all trials take as long as the default settings and none is pruned."""
-    pairs = {
-        f"{tuning.budget} trials, prior {prior}": (tuning.config(prior, {}), tuning.config(prior, {}, seeds))
-        for prior in tuning.priors
-    }
-    title = f"Tuning of {tuning.algorithm.upper()} on {tuning.task}"
-    return forecast_tuned(title, out, pairs, (tuning.budget, 2), episodes, jobs, listener)
+    left_s = [run.seconds for run in runs if run.status != "finished"]
+    return Forecast(folder.study.title, folder.path, jobs, makespan([], left_s, jobs), sum(left_s), tuple(runs))
 
 
 def forecast_tuned(
@@ -96,19 +82,18 @@ def forecast_tuned(
     jobs: int,
     listener: Callable[[int], object],
 ) -> Forecast:
-    """Measure runs that are tuned and judged: by name a trial and a run that judges, and how many there are of each."""
+    """Measure runs that are tuned and judged: by name a trial and a run that judges, and how many there are of each.
+
+    All trials are taken to cost what this one does, and none to be pruned.
+    """
     known, runs, (trials, judged) = dict[str, Cost](), list[RunForecast](), counts
-    for name, configs in pairs.items():
-        trial, last = (_cost(config, episodes, known) for config in configs)
-        seconds = trials * trial.training_s + judged * (last.training_s + last.evaluation_s)
-        steps, count = configs[0].steps, len(configs[0].seeds)
-        runs.append(RunForecast(name, "waiting", steps, 0, count, seconds))
+    for name, (trial, last) in pairs.items():
+        tried, final = _cost(trial, episodes, known), _cost(last, episodes, known)
+        seconds = trials * tried.training_s + judged * (final.training_s + final.evaluation_s)
+        runs.append(RunForecast(name, "waiting", trial.steps, 0, len(trial.seeds), seconds))
         listener(len(runs))
-    return _added_up(title, out, jobs, sum(run.seconds for run in runs) / jobs, runs)
-
-
-def _added_up(title: str, out: Path, jobs: int, seconds: float, runs: Sequence[RunForecast]) -> Forecast:
-    return Forecast(title, out, jobs, seconds, sum(run.seconds for run in runs), tuple(runs))
+    core_seconds = sum(run.seconds for run in runs)
+    return Forecast(title, out, jobs, core_seconds / jobs, core_seconds, tuple(runs))
 
 
 def _cost(config: RunConfig, episodes: int, known: dict[str, Cost]) -> Cost:

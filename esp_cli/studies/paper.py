@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 NUM_SEEDS = 10  # seeds behind every number of the paper
 _FILE = Path(__file__).with_name("paper.json")
 
 
-@dataclass(frozen=True)
-class Reported:
+class Reported(NamedTuple):
     """A number of the paper."""
 
     mean: float  # episode reward, mean over ten seeds

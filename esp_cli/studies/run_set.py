@@ -16,7 +16,6 @@ from typing import ClassVar
 from esp_cli.files.documents import Strict
 from esp_cli.files.opening import holding, is_held
 from esp_cli.files.writing import TEMPORARY_PREFIX
-from esp_cli.studies.paper import Reported, reported
 from esp_cli.training.config import RunConfig
 from esp_cli.training.folder_names import CONFIG, FRESH, LOCK, LOG, METRICS, POLICY, STUDY_LOCK
 from esp_cli.training.metrics import elapsed_s, read_last_row
@@ -25,10 +24,6 @@ from esp_cli.training.settings import parse_config
 from esp_envs.errors import UserError
 
 FOLDER_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")  # so that nothing is written outside of the set
-
-
-class StudyError(UserError):
-    """A folder of runs cannot be made, opened or used; the text is one sentence for the user."""
 
 
 class Cell(Strict):
@@ -41,10 +36,6 @@ class Cell(Strict):
     reference: str | None = None  # name of the cell that it is compared with; None for such a cell itself
     # place of the paper's number, see `paper.reported`; None where there is none that compares
     paper: tuple[str, ...] | None = None
-
-    @property
-    def reported(self) -> Reported | None:
-        return reported(self.paper)
 
 
 class RunSet(ABC):
@@ -66,14 +57,14 @@ class RunSet(ABC):
     def refuse_foreign(cls, path: Path) -> None:
         """Refuse a folder that is neither new nor empty nor one of these, or that has a link where its runs belong."""
         if path.is_file():
-            raise StudyError(f"{path} is a file; choose another --out")
+            raise UserError(f"{path} is a file; choose another --out")
         if (path / cls.runs).is_symlink():
-            raise StudyError(f"{path / cls.runs} is a link, which is not followed; put the folder itself there")
+            raise UserError(f"{path / cls.runs} is a link, which is not followed; put the folder itself there")
         if not cls.is_one(path) and path.is_dir():
             names = (entry.name for entry in path.iterdir())
             foreign = [name for name in names if name != STUDY_LOCK and not name.startswith(TEMPORARY_PREFIX)]
             if foreign:
-                raise StudyError(f"{path} is not empty and no {cls.noun} (it has {foreign[0]!r}); choose another --out")
+                raise UserError(f"{path} is not empty and no {cls.noun} (it has {foreign[0]!r}); choose another --out")
 
     @classmethod
     @contextlib.contextmanager
@@ -104,7 +95,7 @@ class RunSet(ABC):
             return RunFolder.create(path, cell.config.model_dump(mode="json"))
         folder = RunFolder.open(path)
         if parse_config(folder.config, path) != cell.config:
-            raise StudyError(f"{path} holds a run of another configuration; move it away, or choose another --out")
+            raise UserError(f"{path} holds a run of another configuration; move it away, or choose another --out")
         return folder
 
     def progress(self, cell: Cell) -> tuple[int, float]:

@@ -28,7 +28,7 @@ from optuna.trial import TrialState
 from esp_cli.files.documents import parse_value
 from esp_cli.files.formatting import shortened
 from esp_cli.files.writing import mend_last_line, remove_file, replace_file
-from esp_cli.studies.run_set import Cell, RefusedError, RunSet, StudyError
+from esp_cli.studies.run_set import Cell, RefusedError, RunSet
 from esp_cli.studies.tuning import REDUCTION, RUNGS, TUNING_FORMAT, Outcome, Point, Tuning, curve_of, score
 from esp_cli.studies.tuning_space import Dimension, space_of
 from esp_cli.training.build import build_learner
@@ -52,7 +52,7 @@ class Search(RunSet):
     document, runs, noun = TUNING, "trials", "tuning"
 
     def __init__(self, path: Path, tuning: Tuning) -> None:
-        super().__init__(path, f"Tuning of {tuning.algorithm.upper()} on {tuning.task}")
+        super().__init__(path, tuning.title)
         self.tuning = tuning
         keys = [(prior, number) for number in range(tuning.budget) for prior in tuning.priors]
         self._keys = {f"{prior}-{number:03d}": (prior, number) for prior, number in keys}
@@ -72,8 +72,8 @@ class Search(RunSet):
             if not self.trials(prior):
                 self.studies[prior].enqueue_trial(self._defaults(prior))
 
-    def _damaged(self, what: str) -> StudyError:
-        return StudyError(f"{self.path / JOURNAL} is damaged: {what}; choose another --out")
+    def _damaged(self, what: str) -> UserError:
+        return UserError(f"{self.path / JOURNAL} is damaged: {what}; choose another --out")
 
     @classmethod
     def create(cls, path: Path, tuning: Tuning) -> Search:
@@ -85,7 +85,7 @@ class Search(RunSet):
             there = TUNING_FORMAT.parse(file, Tuning)
             same = {"budget": there.budget, "command": there.command}
             if tuning.model_copy(update=same) != there or tuning.budget < there.budget:
-                raise StudyError(
+                raise UserError(
                     f"{path} holds another tuning; go on with it by '{there.command}', or choose another --out"
                 )
         TUNING_FORMAT.write(file, tuning.model_dump(mode="json"))

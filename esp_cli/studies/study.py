@@ -26,13 +26,13 @@ from esp_cli.files.formatting import shortened
 from esp_cli.files.opening import open_own, read_regular
 from esp_cli.files.writing import remove_file
 from esp_cli.policies.evaluation import FinalEvaluation
-from esp_cli.studies.run_set import FOLDER_NAME, Cell, RunSet, StudyError
+from esp_cli.studies.run_set import FOLDER_NAME, Cell, RunSet
 from esp_cli.training.config import RunConfig, completed
 from esp_cli.training.folder_names import FINAL, LOG, STUDY
 from esp_envs.errors import UserError
 from esp_envs.registry import make
 
-STUDY_FORMAT = DocumentFormat("esp-study", 1, "a study", StudyError)
+STUDY_FORMAT = DocumentFormat("esp-study", 1, "a study")
 
 
 class Study(Strict):
@@ -73,7 +73,7 @@ class StudyFolder(RunSet):
         names = [cell.name for cell in study.cells]
         for name in names:
             if not FOLDER_NAME.fullmatch(name) or names.count(name) > 1:
-                raise StudyError(f"{path / STUDY} is damaged: {shortened(repr(name))} is not the name of one run")
+                raise UserError(f"{path / STUDY} is damaged: {shortened(repr(name))} is not the name of one run")
         super().__init__(path, study.title)
         self.study = study
 
@@ -104,7 +104,7 @@ class StudyFolder(RunSet):
         changed = [new.name for new, old in again if new != old.model_copy(update=new.model_dump(include=told))]
         if there.kind != study.kind or there.episodes != study.episodes or changed:
             which = f" ({changed[0]} has other seeds or settings)" if changed else ""
-            raise StudyError(
+            raise UserError(
                 f"{path} holds another study{which}; go on with it by '{there.command.splitlines()[-1]}', or choose "
                 "another --out"
             )
@@ -130,17 +130,17 @@ class StudyFolder(RunSet):
     def open(cls, path: Path) -> StudyFolder:
         """Open an existing study, unless it is missing, damaged, foreign, or of a newer version."""
         if not path.is_dir():
-            raise StudyError(f"{path} is no study: there is no such folder")
+            raise UserError(f"{path} is no study: there is no such folder")
         study = STUDY_FORMAT.parse(path / STUDY, Study)
         if not study.cells:
-            raise StudyError(f"{path / STUDY} is damaged: it names no run; plan the study again under another --out")
+            raise UserError(f"{path / STUDY} is damaged: it names no run; plan the study again under another --out")
         return cls(path, study.model_copy(update={"cells": tuple(map(_completed, study.cells))}))
 
     def _refuse_old_rules(self, cell: Cell) -> None:
         """Refuse a finished run of an earlier version of its task, which other runs are not to stand beside."""
         final = read_evaluation(self.run_path(cell))
         if final is not None and final.task_version != (version := _task_version(cell.config)):
-            raise StudyError(
+            raise UserError(
                 f"{self.run_path(cell)} was evaluated on {final.task} version {final.task_version}, but this is "
                 f"version {version}; choose another --out"
             )

@@ -19,9 +19,9 @@ from esp_cli.checking.measured import planned
 from esp_cli.files.formatting import file_name, format_exactly
 from esp_cli.files.writing import replace_file
 from esp_cli.prior.config import of_no_use_to
-from esp_cli.studies.catalogue import Request, concerns, refuse_varied, task_setting
+from esp_cli.studies.catalogue import Request, refuse_other_tasks, refuse_unknown_or_twice, refuse_varied, settings_of
 from esp_cli.studies.kinds import KINDS, Settings
-from esp_cli.studies.run_set import Cell, StudyError
+from esp_cli.studies.run_set import Cell
 from esp_cli.studies.study import Study, StudyFolder
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config
@@ -161,7 +161,7 @@ class Trials(StudyFolder):
             done = {cell.name for cell in StudyFolder.open(path / FRESH).study.cells}
             for cell in study.cells:
                 if cell.name not in known and (judged := cell.name.rpartition("-")[0]) in done:
-                    raise StudyError(
+                    raise UserError(
                         f"{path / FRESH} has judged {judged} already; keep its --budget, or choose another --out"
                     )
         return cls(path, super().create(path, study, keep).study)
@@ -188,10 +188,7 @@ class Benchmark:
             raise UserError(self.left_out[f"{lost[0]}: {self.methods[0]}"])
 
     def _refuse_wrong(self) -> None:
-        for name in self.methods:
-            if name not in METHODS or self.methods.count(name) > 1:
-                fault = "is named twice" if name in METHODS else "is no method"
-                raise UserError(f"'{name}' {fault}; name each once: {', '.join(map(repr, METHODS))}")
+        refuse_unknown_or_twice("method", self.methods, METHODS)
         if len(self.request.algorithms or ()) > 1 or self.algorithm not in SPACES:
             raise UserError(f"this benchmark tunes one learner, whose space it has; --algo {', '.join(SPACES)}")
         if shared := set(self.request.seeds) & set(TRIAL_SEEDS):
@@ -200,24 +197,17 @@ class Benchmark:
         for board in self.boards.values():
             varied = own | {name for name in board.settings if name.startswith("task.")}
             refuse_varied(self.request.overrides, [board.task], varied)
-        for task, _ in self.request.steps or ():
-            if task is not None and task not in self.boards:
-                raise UserError(f"--steps {task} concerns no run of this study; its tasks are {', '.join(self.boards)}")
+        refuse_other_tasks(self.request.steps or (), self.boards)
 
     def _taken(self) -> Iterator[tuple[str, str]]:
         for name in self.boards:
             for method in self.methods:
-                if reason := self._refusal(name, method):
-                    self.left_out[f"{name}: {method}"] = reason
+                try:
+                    build_learner(self.config(name, method, 0, trial=True).of_one_seed())
+                except UserError as error:
+                    self.left_out[f"{name}: {method}"] = str(error)
                 else:
                     yield name, method
-
-    def _refusal(self, name: str, method: str) -> str:
-        try:
-            build_learner(self.config(name, method, 0, trial=True).of_one_seed())
-        except UserError as error:
-            return str(error)
-        return ""
 
     def steps(self, name: str, trial: bool) -> int:
         """Return the steps per seed of a trial on a task or of the runs that judge, in their usual ratio."""
@@ -235,16 +225,8 @@ class Benchmark:
         board, request, algorithm = self.boards[name], self.request, self.algorithm
         preset = board.preset if (request.preset, algorithm) == ("default", "mappo") else request.preset
         networks = dict(zip((PERCEPTRON, HOMOMORPHIC), board.networks, strict=True))
-        own = {
-            key: networks.get(str(value), value)
-            for key, value in METHODS[method].items()
-            if concerns(key, board.task, algorithm)
-        }
-        given = {
-            task_setting(key, board.task): value
-            for key, value in request.overrides.items()
-            if concerns(key, board.task, algorithm)
-        }
+        of_method, given = (settings_of(some, board.task, algorithm) for some in (METHODS[method], request.overrides))
+        own = {key: networks.get(str(value), value) for key, value in of_method.items()}
         idle = {f"prior.{key}" for key in of_no_use_to(str(own["prior.kind"]))}
         idle |= (_OF_NETWORKS.keys() - own.keys()) | given.keys()
         idle |= set() if board.batches else {f"{algorithm}.{key}" for key in _OF_BATCHES}

@@ -12,7 +12,7 @@ from pydantic import Field, JsonValue
 from esp_cli.checking.measured import planned
 from esp_cli.files.documents import DocumentFormat, Strict
 from esp_cli.files.formatting import file_name, format_count
-from esp_cli.studies.run_set import Cell, StudyError
+from esp_cli.studies.run_set import Cell
 from esp_cli.studies.study import Study
 from esp_cli.studies.tuning_space import Dimension, space_of
 from esp_cli.training.config import RunConfig, resolve_config
@@ -40,6 +40,10 @@ class Tuning(Strict):
     space: dict[str, Dimension]  # what is tried
     device: str = "cpu"  # of every run
     command: str = ""  # the command line behind it
+
+    @property
+    def title(self) -> str:
+        return f"Tuning of {self.algorithm.upper()} on {self.task}"
 
     def config(self, prior: str, settings: Mapping[str, object], seeds: Sequence[int] | None = None) -> RunConfig:
         """Resolve the run of a prior with these settings over those of all runs."""
@@ -108,7 +112,7 @@ class Tuning(Strict):
             self.config(prior, {name: value})
 
 
-TUNING_FORMAT = DocumentFormat("esp-tuning", 1, "a tuning of settings", StudyError)
+TUNING_FORMAT = DocumentFormat("esp-tuning", 1, "a tuning of settings")
 
 
 @dataclass(frozen=True)

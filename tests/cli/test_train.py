@@ -319,7 +319,7 @@ def test_a_page_that_cannot_be_drawn_is_told_once_and_stops_no_run(tmp_path, mon
     def fails(*_: object, **__: object) -> None:
         raise MemoryError("no room for pixels")
 
-    monkeypatch.setattr("esp_cli.reporting.live.draw", fails)
+    monkeypatch.setattr("esp_cli.reporting.live.draw_film", fails)
     said = esp("train", "--steps", 100, *TINY_OPTIONS, "--out", tmp_path / "run", "--watch").stderr
     assert said.count("tracking with --watch ended: it cannot write (no room for pixels); the run goes on") == 1
     assert (tmp_path / "run" / "policy.safetensors").is_file()

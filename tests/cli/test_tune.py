@@ -37,14 +37,14 @@ def test_a_dry_run_states_the_cost_of_equal_budgets_and_makes_nothing(command: l
         (["--budget", "1" + "0" * 309], "--budget"),
         (["--task", "formation"], "esp tune takes one --task, not 2; run it once for each"),
         (["--algo", "mappo,qmix"], "esp tune takes one --algo, not 2"),
-        (["--prior", "magic"], "--prior names each kind once; they are none, esp, auto, augment, consistency"),
+        (["--prior", "magic"], "'magic' is no kind of prior; name each once: 'none', 'esp', "),
         (["--set", "mappo.learning_rate=1e-3"], "--set mappo.learning_rate fixes what the space varies"),
         (["--algo", "qmix"], "cannot set 'mappo.num_envs'"),
         (["--algo", "mapo"], "unknown algorithm 'mapo'; did you mean 'mappo'?"),
         (["--set", "prior.kind=none"], "takes the kinds of prior by --prior"),
         (["--gpu-share", "0.5"], "--gpu-share is for GPUs of a Ray cluster; add --engine ray"),
         (["--seed-list", "1001"], "seed 1001 belongs to the trials"),
-        (["--steps", "formation=500k"], "--steps formation=500000 concerns no run of this tuning"),
+        (["--steps", "formation=500k"], "--steps formation=500000 concerns no run here; the tasks are navigation"),
     ],
 )
 def test_what_is_wrong_is_told_before_there_is_a_folder(command, tmp_path, options, sentence):

@@ -16,7 +16,7 @@ from esp_cli.commands.options import parse_assignments
 from esp_cli.policies import bundled
 from esp_cli.policies.bundled import MANIFEST, Entry, bundled_folder, find, read_bundled, standard_name
 from esp_cli.policies.evaluation import best_seed, evaluate, play_batches
-from esp_cli.policies.loading import load_entry, open_policy
+from esp_cli.policies.loading import open_policy
 from esp_cli.policies.statistics import mean_and_sem, normalised
 from esp_cli.training.build import PolicyController
 from esp_cli.training.config import RunConfig, resolve_config, resolve_task_settings
@@ -32,7 +32,7 @@ EPISODES = {"formation": 8}
 def test_a_policy_does_what_its_manifest_says(entry: Entry) -> None:
     file = bundled_folder() / entry.file
     assert hashlib.sha256(file.read_bytes()).hexdigest() == entry.sha256
-    trained = load_entry(entry)
+    trained = open_policy(Path(entry.name))
     assert (trained.spec.version, trained.spec.convention) == (entry.task_version, entry.convention)
     controller = PolicyController(trained.policy)
     played = play_batches(trained.config, controller, "greedy", EPISODES.get(entry.task, 128))
@@ -113,7 +113,7 @@ def test_what_is_put_in_is_found_and_plays_the_same(small: Path) -> None:
     entry = find("navigation")
     assert (entry.name, entry.file) == ("navigation-mappo-esp", "navigation-mappo-esp.safetensors")
     assert (entry.chosen_from, entry.score.episodes, entry.step) == (2, 4, 100)
-    trained = load_entry(entry)
+    trained = open_policy(Path(entry.name))
     assert trained.config.seeds == (entry.seed,)
     found = evaluate(trained, 4)
     assert found.greedy.mean == pytest.approx(entry.score.mean)

@@ -26,7 +26,6 @@ from esp_cli.studies import engine_ray
 from esp_cli.studies.engine import Engine, LocalEngine
 from esp_cli.studies.engine_ray import (
     CLUSTER_FORMAT,
-    ClusterError,
     RayEngine,
     refuse_difference,
     refuse_what_no_node_has,
@@ -38,6 +37,7 @@ from esp_cli.studies.scheduler import Scheduler, Snapshot
 from esp_cli.studies.study import Study, StudyFolder
 from esp_cli.training.metrics import read_metrics
 from esp_cli.training.run_folder import RunFolder, checkpoints_in, step_of
+from esp_envs.errors import UserError
 from tests.cli.running import TINY_OPTIONS
 from tests.studies.small_studies import small_study
 from tests.studies.test_tuning import tuning
@@ -275,7 +275,7 @@ def test_a_run_that_no_node_has_room_for_fails_at_once(folder, engine, monkeypat
 )
 def test_fewer_seeds_are_advised_only_where_memory_is_what_is_missing(node: dict[str, float], advice: str) -> None:
     needed = {"CPU": 1, "GPU": 1, "memory": 2e9}
-    with pytest.raises(ClusterError) as told:
+    with pytest.raises(UserError) as told:
         refuse_what_no_node_has(needed, "esp", [node])
     assert str(told.value) == (
         f"no node of the cluster offers what esp needs (a core, a GPU, 2.0 GB of memory); {advice}"
@@ -286,7 +286,7 @@ def test_fewer_seeds_are_advised_only_where_memory_is_what_is_missing(node: dict
 def test_a_cluster_that_does_not_answer_is_refused_in_one_sentence(folder: StudyFolder) -> None:
     for address, reason in (("127.0.0.1:1", "refused"), ("ray://127.0.0.1:1", "client is not supported")):
         with pytest.raises(
-            ClusterError, match=rf"cannot use the Ray cluster at {address} \(.*{reason}\); check --address"
+            UserError, match=rf"cannot use the Ray cluster at {address} \(.*{reason}\); check --address"
         ):
             RayEngine(folder.path, address)
 

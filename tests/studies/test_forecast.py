@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from esp_cli.studies import forecast as module
-from esp_cli.studies.forecast import Cost, forecast_search
+from esp_cli.studies.forecast import Cost, forecast_tuned
 from esp_cli.studies.forecast import forecast_study as forecast
 from esp_cli.studies.study import StudyFolder
 from tests.studies.small_studies import small_study, write_run
@@ -79,7 +79,9 @@ def test_a_finished_run_is_not_measured(tmp_path: Path, probed: list[str]) -> No
 
 def test_the_forecast_of_a_search_by_hand(tmp_path: Path, probed: list[str]) -> None:
     """Each prior: 6 trials of 100 s, and two runs of 104 s."""
-    found = forecast_search(tuning(budget=6), tmp_path, (0, 1, 2, 3), 2, 2, lambda done: None)
+    asked = tuning(budget=6)
+    pairs = {prior: (asked.config(prior, {}), asked.config(prior, {}, (0, 1, 2, 3))) for prior in asked.priors}
+    found = forecast_tuned(asked.title, tmp_path, pairs, (6, 2), 2, 2, lambda done: None)
     assert [run.seconds for run in found.runs] == [6 * 100.0 + 2 * 104.0] * 2
     assert (found.core_seconds, found.seconds) == (2 * 808.0, 808.0)
 

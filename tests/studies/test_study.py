@@ -8,8 +8,8 @@ import pytest
 from esp_cli.files.opening import LockError, is_held
 from esp_cli.files.writing import TEMPORARY_PREFIX
 from esp_cli.studies.engine import LocalEngine
-from esp_cli.studies.run_set import StudyError
 from esp_cli.studies.study import StudyFolder, read_evaluation
+from esp_envs.errors import UserError
 from tests.studies.small_studies import small_study, write_study
 
 ENDS = {"MAPPO": [-120.0, -121.0, -122.0]}
@@ -118,7 +118,7 @@ def test_one_process_holds_a_study(tmp_path):
 
 def test_no_lock_is_made_in_a_folder_of_something_else(tmp_path):
     (tmp_path / "thesis.tex").touch()
-    with pytest.raises(StudyError, match="is not empty and no study"), StudyFolder.held(tmp_path):
+    with pytest.raises(UserError, match="is not empty and no study"), StudyFolder.held(tmp_path):
         pass
     assert [entry.name for entry in tmp_path.iterdir()] == ["thesis.tex"]
 
@@ -132,7 +132,7 @@ def test_a_run_may_be_compared_with_another_one_than_before_and_with_no_other_se
     assert [cell.reference for cell in StudyFolder.open(tmp_path / "s").study.cells] == [None] * len(study.cells)
     config = first.config.model_copy(update={"steps": 10**6})
     changed = study.model_copy(update={"cells": (first.model_copy(update={"config": config}), *others)})
-    with pytest.raises(StudyError, match=f"{first.name} has other seeds or settings"):
+    with pytest.raises(UserError, match=f"{first.name} has other seeds or settings"):
         StudyFolder.create(tmp_path / "s", changed)
 
 
@@ -193,7 +193,7 @@ def test_a_run_of_another_version_of_the_task_is_no_twin_and_its_study_does_not_
     folder = StudyFolder.create(tmp_path / "s", small_study())
     assert other.is_finished(plain)
     assert folder.find_twin(folder.study.cells[0], [other]) is None
-    with pytest.raises(StudyError, match="was evaluated on navigation version 2, but this is version 1"):
+    with pytest.raises(UserError, match="was evaluated on navigation version 2, but this is version 1"):
         StudyFolder.create(other.path, small_study())
 
 
@@ -270,5 +270,5 @@ def test_runs_are_not_written_through_a_link(tmp_path):
     (tmp_path / "outside").mkdir()
     (tmp_path / "s").mkdir()
     (tmp_path / "s" / "runs").symlink_to(tmp_path / "outside")
-    with pytest.raises(StudyError, match="runs is a link, which is not followed"), StudyFolder.held(tmp_path / "s"):
+    with pytest.raises(UserError, match="runs is a link, which is not followed"), StudyFolder.held(tmp_path / "s"):
         pass

@@ -12,10 +12,10 @@ from esp_cli.reporting.page import answer
 from esp_cli.reporting.results import summarised
 from esp_cli.reporting.tables import TABLES
 from esp_cli.studies.catalogue import Request
-from esp_cli.studies.run_set import StudyError
 from esp_cli.studies.study import StudyFolder
 from esp_cli.studies.symmetry import METHODS, TASKS, TRIAL_SEEDS, Benchmark, Trials, draws, score
 from esp_envs import make
+from esp_envs.errors import UserError
 from tests.studies.small_studies import write_run
 from tests.training.runs import TINY
 
@@ -115,7 +115,7 @@ def test_what_is_judged_gets_no_further_trials_but_other_methods_do(tmp_path: Pa
     judged = asked.judged(write_trials(tmp_path / "s", asked, {}))
     Trials.create(tmp_path / "s", benchmark(budget=4, variants=("plain",)).trials)
     StudyFolder.create(tmp_path / "s" / "fresh", judged)
-    with pytest.raises(StudyError, match="has judged navigation-200k-esp already; keep its --budget"):
+    with pytest.raises(UserError, match="has judged navigation-200k-esp already; keep its --budget"):
         Trials.create(tmp_path / "s", benchmark(budget=4).trials)
     assert len(Trials.create(tmp_path / "s", benchmark(variants=("copies",)).trials).study.cells) == 6 + 1 + 3
 
@@ -135,7 +135,7 @@ def test_what_is_judged_gets_no_further_trials_but_other_methods_do(tmp_path: Pa
         ),
         ({"overrides": {"mappo.lr": 1}}, "unknown setting 'mappo.lr'"),
         ({"tasks": ("navigation", "chess")}, "unknown task 'chess'"),
-        ({"steps": (("formation", 1000),)}, "--steps formation concerns no run of this study"),
+        ({"steps": (("formation", 1000),)}, "--steps formation=1000 concerns no run here; the tasks are "),
         ({"steps": ((None, 100), (None, 200))}, "--steps gives navigation several numbers"),
     ],
 )

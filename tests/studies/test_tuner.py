@@ -14,13 +14,14 @@ pytest.importorskip("optuna", reason="needs Optuna, of the extra tune")
 from optuna.trial import TrialState
 
 from esp_cli.reporting.tuning_page import budget_sentence, budget_table, settings_table, write_page
-from esp_cli.studies.run_set import RefusedError, StudyError
+from esp_cli.studies.run_set import RefusedError
 from esp_cli.studies.scheduler import Scheduler
 from esp_cli.studies.search import Search
 from esp_cli.studies.tuning import Point, Tuning
 from esp_cli.studies.tuning_space import Dimension
 from esp_cli.training.config import resolve_config
 from esp_cli.training.settings import read_config_file
+from esp_envs.errors import UserError
 from tests.studies.test_tuning import SPACE, tuning
 
 
@@ -106,11 +107,11 @@ def test_a_tuning_goes_on_in_its_folder_with_a_budget_that_grows(tmp_path):
     Search.create(tmp_path / "t", tuning())
     assert Search.create(tmp_path / "t", tuning(budget=8)).tuning.budget == 8
     for other in (tuning(budget=2), tuning(budget=8, steps=100), tuning(budget=8, priors=("esp",))):
-        with pytest.raises(StudyError, match="holds another tuning"):
+        with pytest.raises(UserError, match="holds another tuning"):
             Search.create(tmp_path / "t", other)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").touch()
-    with pytest.raises(StudyError, match="is not empty and no tuning"):
+    with pytest.raises(UserError, match="is not empty and no tuning"):
         Search.create(tmp_path / "mine", tuning())
 
 
@@ -254,7 +255,7 @@ def test_a_damaged_journal_is_told_in_one_sentence(tmp_path):
     journal = tmp_path / "t" / "journal.jsonl"
     first, *others = journal.read_bytes().splitlines(keepends=True)
     journal.write_bytes(first + b"{torn}\n" + b"".join(others))
-    with pytest.raises(StudyError, match=r"journal.jsonl is damaged"):
+    with pytest.raises(UserError, match=r"journal.jsonl is damaged"):
         Search.create(tmp_path / "t", tuning(priors=("none",), budget=1))
 
 
@@ -288,7 +289,7 @@ def test_a_forged_journal_is_refused_in_one_sentence_or_gone_on_with(tmp_path):
                 found.begin(found.cells[3])
             shutil.rmtree(found.run_path(found.cells[3]), ignore_errors=True)  # the next one proposes other settings
             other += 1
-        except StudyError as error:
+        except UserError as error:
             refused.append(str(error))
         except Exception as error:
             raise AssertionError(name) from error

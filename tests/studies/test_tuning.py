@@ -8,10 +8,10 @@ import pytest
 
 from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.studies import symmetry
-from esp_cli.studies.run_set import StudyError
 from esp_cli.studies.tuning import TUNING_FORMAT, Point, Tuning, curve_of, fresh_study, score
 from esp_cli.studies.tuning_space import Dimension, default_space, read_space, space_of
 from esp_cli.training.metrics import MetricsError
+from esp_envs.errors import UserError
 from tests.training.runs import TINY
 
 SPACE = {"mappo.learning_rate": Dimension(low=1e-4, high=1e-1, log=True), "mappo.gamma": Dimension(choices=(0.9, 0.99))}
@@ -167,7 +167,7 @@ def test_a_tuning_of_an_earlier_version_loads_unless_it_was_for_steps_or_seconds
     TUNING_FORMAT.write(path, stored | {"goal": "return", "reach": None})
     assert TUNING_FORMAT.parse(path, Tuning) == tuning()
     TUNING_FORMAT.write(path, stored | {"goal": "steps", "reach": -15.0})
-    with pytest.raises(StudyError, match=r"tuning\.json: this esp has no 'goal' any more; use the esp that wrote it"):
+    with pytest.raises(UserError, match=r"tuning\.json: this esp has no 'goal' any more; use the esp that wrote it"):
         TUNING_FORMAT.parse(path, Tuning)
 
 
