@@ -56,20 +56,15 @@ def _sections(of: str | None) -> Sequence[Section]:
 
 
 def _print(sections: Sequence[Section]) -> None:
-    with console.paged():
-        for section in sections:
-            _print_section(section)
-
-
-def _print_section(section: Section) -> None:
-    prefix = section.settings[0].name.rpartition(".")[0] if section.settings else section.name
-    option = {"task": "--task", "algorithm": "--algo", "network": "--network"}.get(section.kind)
-    title = f"{section.name}: --set {prefix}.NAME=VALUE" + (f", with {option} {section.name}" if option else "")
-    rows = [
-        (one.name.rpartition(".")[2], _written(one.default), one.bounds or one.type, one.unit, _meaning(one))
-        for one in section.settings
-    ]
-    console.table(("setting", "default", "values", "unit", "meaning"), rows, title=title)
+    for section in sections:
+        prefix = section.settings[0].name.rpartition(".")[0] if section.settings else section.name
+        option = {"task": "--task", "algorithm": "--algo", "network": "--network"}.get(section.kind)
+        title = f"{section.name}: --set {prefix}.NAME=VALUE" + (f", with {option} {section.name}" if option else "")
+        rows = [
+            (one.name.rpartition(".")[2], _written(one.default), one.bounds or one.type, one.unit, _meaning(one))
+            for one in section.settings
+        ]
+        console.table(("setting", "default", "values", "unit", "meaning"), rows, title=title)
 
 
 def _meaning(setting: Setting) -> str:

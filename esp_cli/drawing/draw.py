@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Literal, get_args
 
 import matplotlib as mpl
-from matplotlib.figure import Figure
 
 from esp_cli.defaults import SLOWEST
 from esp_cli.drawing.figures import INCHES, PAPER, PAPER_DPI, STEADY, saved, summary
@@ -122,7 +121,10 @@ def draw(
             write_film(request.out, painter, taken, step_s, lambda done: report(done, len(taken)))
         elif flat:
             shown = [(own[0], title or spec.name) for own, title in zip(recorded, titles, strict=True)]
-            write_figure(request, lambda: summary(shown, spec.control_period_s, request.inches))
+            style, dpi = ({}, request.size / INCHES) if request.width is None else (PAPER, PAPER_DPI)
+            with mpl.rc_context({**style, **STEADY}):
+                content = saved(summary(shown, spec.control_period_s, request.inches), request.kind[1:], dpi)
+            write_file(request.out, content)
         elif request.for_print:
             raise UserError(f"what draws {spec.name} gives pixels, not lines; name a .png file without --width")
         else:
@@ -130,14 +132,6 @@ def draw(
     steps = sum(episode.steps for episode in recorded[0])
     returns = tuple(sum(episode.returns[-1] for episode in own) / len(own) for own in recorded)
     return Drawing(request.out, 1 if request.is_picture else len(taken), steps, returns, painter.note)
-
-
-def write_figure(request: Request, make: Callable[[], Figure]) -> None:
-    """Make a figure in the style that was asked for, and write it as PNG, PDF or SVG."""
-    style, dpi = ({}, request.size / INCHES) if request.width is None else (PAPER, PAPER_DPI)
-    with mpl.rc_context({**style, **STEADY}):
-        content = saved(make(), request.kind[1:], dpi)
-    write_file(request.out, content)
 
 
 def _acting(request: Request, policies: Sequence[TrainedPolicy]) -> list[TrainedPolicy]:

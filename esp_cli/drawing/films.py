@@ -29,7 +29,6 @@ _BAR, _TICKS, _SIDE = 2.0, 1.5, 2.6  # height of a bar of text, of the numbers b
 _OVERSAMPLING = 3
 _GAP = 8  # pixels between two pictures
 GIF_FRAMES_PER_SECOND = 50  # players slow down a GIF that is faster
-_GIF_TICK_S = 0.01
 
 
 @dataclass(frozen=True)
@@ -195,6 +194,5 @@ def _ticks(low: float, high: float, spacing: float, scale: float, size: int) -> 
 
 def _milliseconds(seconds: Sequence[float]) -> list[int]:
     """Round to the hundredths that a GIF knows, so that the errors do not add up."""
-    ticks = np.diff(np.rint(np.cumsum(seconds) / _GIF_TICK_S), prepend=0)
-    shortest = 1 / (GIF_FRAMES_PER_SECOND * _GIF_TICK_S)
-    return [round(tick * _GIF_TICK_S * 1000) for tick in np.maximum(ticks, shortest)]
+    hundredths = np.diff(np.rint(100 * np.cumsum(seconds)), prepend=0)
+    return [10 * int(count) for count in np.maximum(hundredths, 100 // GIF_FRAMES_PER_SECOND)]
