@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated
 
 from typer import Argument
@@ -75,12 +74,6 @@ def _meaning(setting: Setting) -> str:
 
 
 def _written(value: object) -> str:
-    if value is None:
-        return "-"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, float):
-        return f"{value:g}"
-    if isinstance(value, Mapping):
-        return json.dumps(value)
-    return f"[{','.join(map(str, value))}]" if isinstance(value, list | tuple) else str(value)
+    if value is None or isinstance(value, str):
+        return value or "-"
+    return f"{value:g}" if isinstance(value, float) else json.dumps(value, separators=(",", ":"))
