@@ -10,7 +10,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import imageio.v3 as iio
 import numpy as np
 from imageio.v2 import get_writer
 from numpy.typing import NDArray
@@ -107,11 +106,6 @@ def write_mp4(path: Path, frames: Iterable[Frame], frames_per_second: float) -> 
                 odd = [(0, size % 2) for size in frame.shape[:2]]  # the format asks for even sizes
                 writer.append_data(np.pad(frame, (*odd, (0, 0)), mode="edge"))
         write_file(path, film.read_bytes())
-
-
-def write_png(path: Path, picture: Frame) -> None:
-    """Write one picture."""
-    write_file(path, iio.imwrite("<bytes>", picture, extension=".png"))
 
 
 def _total(episode: Episode) -> str:
