@@ -68,8 +68,8 @@ def _print(result: FinalEvaluation, policy: str) -> None:
 
     def row(label: str, mean: float | None, error: SeedSummary | EpisodeSpread) -> tuple[str, ...]:
         scaled = None if mean is None else normalised(mean, result.anchors)
-        interval = console.format_interval(error.ci95)
-        return label, console.format_mean(mean, error.sem), interval, console.format_mean(scaled)
+        score = "-" if scaled is None else f"{scaled:.2f}"
+        return label, console.format_mean(mean, error.sem), console.format_interval(error.ci95), score
 
     names = {"random": "random", "heuristic": f"heuristic {''.join(result.heuristics[:1])}"}
     names = {key: names.get(key, f"heuristic {key}") for key in result.anchors}

@@ -244,7 +244,7 @@ def _report(trainer: Trainer, path: Path, config: RunConfig, anchors: Mapping[st
         good = values[np.isfinite(values)]  # a seed that stopped has none
         mean, sem = mean_and_sem(good)
         scaled = normalised(mean, anchors) if good.size else None
-        rows.append((mode, console.format_mean(mean, sem), len(good), console.format_mean(scaled)))
+        rows.append((mode, console.format_mean(mean, sem), len(good), "-" if scaled is None else f"{scaled:.2f}"))
     caption = f"convention {trainer.learner.spec.convention}; mean ± s.e.m. over seeds, last evaluation"
     if anchors:
         columns += ("normalised>",)
