@@ -39,7 +39,6 @@ _HOMES = dict.fromkeys(__all__, "esp_envs.spec") | {
     "Symmetry": "esp_cli.loop.symmetry",
     "Transitions": "esp_cli.checking",
     "__version__": "esp_cli.defaults",
-    "discrete_moves": "esp_envs.spec",
     "load_policy": "esp_cli.policies.loaded",
     "train": "esp_cli.run",
 }

@@ -23,11 +23,15 @@ from esp_cli.commands import COMMANDS
 from esp_cli.commands.help import arrange
 from esp_cli.defaults import __version__
 from esp_cli.files import formatting
-from esp_cli.files.formatting import did_you_mean
 from esp_envs.errors import UserError
+from esp_envs.installed import last_line, raised_in
 
 _LACK_OF_MEMORY = re.compile("can't allocate memory|out of memory")  # as torch says it
-_HELP_NAMES = {"help_option_names": ["-h", "--help"]}
+_LOOKS: dict[str, Any] = {
+    "context_settings": {"help_option_names": ["-h", "--help"]},
+    "pretty_exceptions_enable": False,
+    "rich_markup_mode": "rich",
+}
 _OTHER_NAMES = {
     "--seed": "--seeds 3 takes the seeds 0 to 2, --seed-list 7 that seed",
     "--num-envs": "write --set mappo.num_envs=64",
@@ -50,7 +54,7 @@ class LazyGroup(TyperGroup):
         """Find the command that the first argument names, or say which one is like it."""
         name = args[0]
         if name not in COMMANDS and not name.startswith("-"):
-            hint = did_you_mean(name, COMMANDS) or "; 'esp --help' lists the commands"
+            hint = formatting.did_you_mean(name, COMMANDS) or "; 'esp --help' lists the commands"
             raise UserError(f"there is no command '{name}'{hint}")
         return super().resolve_command(ctx, args)
 
@@ -97,9 +101,7 @@ def build_command(name: str, target: str) -> Any:
     """Import "module:function" and make it a typer command, with the module's `EPILOG` below its help."""
     module_name, function_name = target.split(":")
     module = import_module(module_name)
-    single = typer.Typer(
-        add_completion=False, rich_markup_mode="rich", pretty_exceptions_enable=False, context_settings=_HELP_NAMES
-    )
+    single = typer.Typer(add_completion=False, **_LOOKS)
     single.command(name, epilog=getattr(module, "EPILOG", None))(getattr(module, function_name))
     command = typer.main.get_command(single)
     command.name = name
@@ -127,22 +129,13 @@ def report(failure: Exception | SystemExit) -> int | None:
     if isinstance(failure, MemoryError) or (isinstance(failure, RuntimeError) and _LACK_OF_MEMORY.search(str(failure))):
         console.error("this needs more memory than there is; choose fewer agents, worlds, episodes or seeds")
         return EXIT_MACHINE
-    installed = sys.modules.get("esp_envs.installed")  # not imported: then no code of the user ran
-    place = None if installed is None else installed.raised_in(failure)
-    if installed is None or place is None:
+    if (place := raised_in(failure)) is None:
         return None
-    console.error(f"your code raises in {place}: {installed.last_line(failure)}; ESP_TRACEBACK=1 shows the traceback")
+    console.error(f"your code raises in {place}: {last_line(failure)}; ESP_TRACEBACK=1 shows the traceback")
     return EXIT_USER
 
 
-app = typer.Typer(
-    name="esp",
-    cls=LazyGroup,
-    no_args_is_help=True,
-    context_settings=_HELP_NAMES,
-    pretty_exceptions_enable=False,
-    rich_markup_mode="rich",
-)
+app = typer.Typer(name="esp", cls=LazyGroup, no_args_is_help=True, **_LOOKS)
 
 
 def _print_version(wanted: bool) -> None:

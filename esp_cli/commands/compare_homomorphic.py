@@ -9,7 +9,7 @@ from typer import Option
 
 from esp_cli.commands.options import check_finite
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
-from esp_cli.commands.studying import forecast_study, run_study
+from esp_cli.commands.studying import run_or_forecast
 from esp_cli.defaults import Mode
 from esp_envs.errors import UserError
 
@@ -40,14 +40,11 @@ def compare_homomorphic(
     Called again, it goes on where it was.
     """
     names = parse_names([methods]) if methods is not None else None
-    limits = [] if threshold is None else [threshold]
-    check_finite("--threshold", *limits)
+    choices.mode, choices.thresholds = mode, () if threshold is None else (threshold,)
+    check_finite("--threshold", *choices.thresholds)
     request = choices.request()
     board = {"task.num_agents": drones, "task.width": grid, "task.height": grid}
     if twice := sorted(board.keys() & request.overrides.keys()):
         raise UserError(f"--drones and --grid say what {twice[0]} is; leave --set {twice[0]} out")
     request = replace(request, overrides={**board, **request.overrides}, variants=names, group=group)
-    if choices.dry_run:
-        forecast_study("homomorphic", request, choices)
-    else:
-        run_study("homomorphic", request, choices, mode, limits)
+    run_or_forecast("homomorphic", request, choices)

@@ -6,7 +6,6 @@ import re
 from collections.abc import Iterable
 from decimal import Decimal
 
-from esp_cli import console
 from esp_cli.defaults import MAX_SEED, MAX_SEEDS, MAX_STEPS
 from esp_envs.errors import UserError
 
@@ -29,22 +28,16 @@ def parse_count(value: str | int) -> int:
     return int(count)
 
 
-def parse_seeds(value: str | int | Iterable[int]) -> tuple[int, ...]:
-    """Read how many seeds a run has: "10" means the ten seeds 0..9; a list, as 3,7, is taken too, with a note."""
-    if not isinstance(value, str | int):
-        return tuple(value)
+def parse_seeds(value: str | int) -> tuple[int, ...]:
+    """Read how many seeds a run has: "10" means the ten seeds 0..9."""
     text = str(value).strip()
-    if re.fullmatch(r"\d{1,9}", text):
-        if not 1 <= int(text) <= MAX_SEEDS:
-            raise UserError(
-                f"{text} seeds cannot be trained at once; ask for 1 to {MAX_SEEDS}, or name one by --seed-list {text}"
-            )
-        return tuple(range(int(text)))
-    if not _SEED_LIST.fullmatch(text):
-        raise UserError(f"'{text}' does not name seeds; write how many, as --seeds 10, or which, as --seed-list 3,7")
-    seeds = parse_seed_list(text)
-    console.note(f"--seeds {text} is now --seed-list {','.join(map(str, seeds))}")
-    return seeds
+    if not re.fullmatch(r"\d{1,9}", text):
+        raise UserError(f"'{text}' does not say how many seeds; write --seeds 10, or which, as --seed-list 3,7")
+    if not 1 <= int(text) <= MAX_SEEDS:
+        raise UserError(
+            f"{text} seeds cannot be trained at once; ask for 1 to {MAX_SEEDS}, or name one by --seed-list {text}"
+        )
+    return tuple(range(int(text)))
 
 
 def parse_seed_list(value: str | Iterable[int]) -> tuple[int, ...]:

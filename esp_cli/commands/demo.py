@@ -13,7 +13,6 @@ from typer import Option
 
 from esp_cli import console
 from esp_cli.commands import options
-from esp_cli.commands.study_options import changed
 from esp_cli.commands.study_progress import StudyProgress
 from esp_cli.files.formatting import format_count
 
@@ -28,10 +27,6 @@ EPILOG = """Examples:\n
 STEPS, SEEDS = 50_000, (0, 1, 2)
 LABELS = {"none": "MAPPO", "esp": "MAPPO with symmetry"}
 CURVES, FILM = "curves.png", "film.gif"
-if TYPE_CHECKING:
-    _SeedsOption = tuple[int, ...] | None
-else:
-    _SeedsOption = changed(options.SeedsOption, show_default=str(len(SEEDS)))
 _EVALUATIONS, _EPISODES, _FILM_EPISODES, _FILM_PIXELS = 10, 100, 3, 320
 
 
@@ -39,7 +34,7 @@ def demo(
     context: typer.Context,
     task: options.TaskOption = "predator-prey",
     steps: options.StepsOption = STEPS,
-    seeds: _SeedsOption = None,
+    seeds: Annotated[options.Seeds | None, options.seeds_option(len(SEEDS))] = None,
     out: Annotated[Path, Option("--out", "-o", help="Folder of both runs, picture and film.")] = Path("runs/demo"),
     settings: options.SetOption = None,
 ) -> None:

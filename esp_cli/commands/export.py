@@ -60,20 +60,14 @@ def export(
     for text in trained.notes:
         console.note(text)
     chosen = _best(trained, episodes or EPISODES) if seed is None else seed
-    if not trained.spec.roles:
-        exported = write(trained.single_seed(chosen), formats, out, force)
-        console.result(json, exported, lambda: _print(exported, f"{policy}, seed {chosen}", out))
-        return
-    each = {
-        role.name: write(trained.of_role(role.name).single_seed(chosen), formats, out / role.name, force)
-        for role in trained.spec.roles
-    }
+    parts = {role.name: trained.of_role(role.name) for role in trained.spec.roles} or {"": trained}
+    written = {role: write(part.single_seed(chosen), formats, out / role, force) for role, part in parts.items()}
 
     def show() -> None:
-        for role, one in each.items():
-            _print(one, f"{policy}, {role}, seed {chosen}", out / role)
+        for role, one in written.items():
+            _print(one, f"{policy}{f', {role}' if role else ''}, seed {chosen}", out / role)
 
-    console.result(json, each, show)
+    console.result(json, written if trained.spec.roles else written[""], show)
 
 
 def _best(trained: TrainedPolicy, episodes: int) -> int:

@@ -25,6 +25,7 @@ EPILOG = """Examples:\n
     esp mirror robot.xml --order joints.txt --emit rsl_rl -o mirror.py\n
     esp check mirror symmetry:compute_symmetric_states robot.xml"""
 
+_OF_A_JOINT = ("joint", "image", "sign", "gap", "planted")  # of `Body.rows`, as JSON has them
 _NAMED = 6  # of sensors and others; the others are in the JSON
 _SHOWN = 4  # elements that have a column in the table; the others are in the JSON
 
@@ -71,17 +72,8 @@ def described(body: Body, model: Path) -> dict[str, Any]:
     elements = {}
     for name, one in body.found.items():
         joints = [
-            {
-                "joint": joint,
-                "image": image,
-                "sign": sign,
-                "gap": gap,
-                "planted": planted,
-                "differs": d.what,
-                "by": d.share,
-                "differences": d.shares,
-            }
-            for joint, image, sign, gap, planted, d in body.rows(name)
+            {**dict(zip(_OF_A_JOINT, row, strict=True)), "differs": d.what, "by": d.share, "differences": d.shares}
+            for *row, d in body.rows(name)
         ]
         base = {} if one.base is None else {"base": one.base.shares}
         elements[name] = {**one.proof.summary, **base, "joints": joints}

@@ -185,29 +185,32 @@ StepsOption = Annotated[
     ),
 ]
 if TYPE_CHECKING:
-    SeedsOption = tuple[int, ...] | None
-    SeedListOption = tuple[int, ...] | None
+    Seeds = tuple[int, ...]
 else:  # typer trusts the parser for a plain `tuple`, but would read tuple[int, ...] as a pattern of its own
-    SeedsOption = Annotated[
-        tuple | None,
-        Option(
-            "--seeds",
-            "-s",
-            help="How many seeds to train at once: 10 means the seeds 0 to 9.",
-            show_default="1",
-            metavar="COUNT",
-            parser=_option_parser(parse_seeds, "COUNT"),
-        ),
-    ]
-    SeedListOption = Annotated[
-        tuple | None,
-        Option(
-            "--seed-list",
-            help="Which seeds to train at once, by number, as 3,7.",
-            metavar="SEEDS",
-            parser=_option_parser(parse_seed_list, "SEEDS"),
-        ),
-    ]
+    Seeds = tuple
+
+
+def seeds_option(default: int) -> Any:
+    """Return `--seeds` of a command that trains this many by default."""
+    return Option(
+        "--seeds",
+        "-s",
+        help="How many seeds to train at once: 10 means the seeds 0 to 9.",
+        show_default=str(default),
+        metavar="COUNT",
+        parser=_option_parser(parse_seeds, "COUNT"),
+    )
+
+
+SeedListOption = Annotated[
+    Seeds | None,
+    Option(
+        "--seed-list",
+        help="Which seeds to train at once, by number, as 3,7.",
+        metavar="SEEDS",
+        parser=_option_parser(parse_seed_list, "SEEDS"),
+    ),
+]
 OutOption = Annotated[Path, Option("--out", "-o", help="Path of the output.")]
 Device = Literal["auto", "cpu", "cuda"]
 NoCheckOption = Annotated[

@@ -31,8 +31,7 @@ def policies(
         raise UserError(f"{bundled_folder()} has no policy of {task or 'any task'}; 'esp policies' lists all")
 
     def show() -> None:
-        with console.paged():
-            _print(entries)
+        _print(entries)
         for entry in entries if task else ():
             console.say(f"{entry.name}: {entry.command}")
         console.note("esp eval, esp render and esp export take a policy by its name, or by its task")
@@ -52,7 +51,7 @@ def _print(entries: Sequence[Entry]) -> None:
                 f"{e.seed} of {e.chosen_from}",
                 f"{e.score.mean:.2f}",
                 console.format_interval(e.score.ci95),
-                "-" if e.normalised is None else f"{e.normalised:.2f}",
+                console.format_mean(e.normalised),
             )
             for e in group
         ]

@@ -105,9 +105,8 @@ def print_answer(material: Material, full: bool, thresholds: Sequence[float] = (
     from esp_cli.reporting.page import answer
     from esp_cli.reporting.tables import all_tables
 
-    with console.paged():
-        for table in all_tables(material.results) if full else ():
-            console.table(table.headings, table.rows, title=table.title, caption=table.caption)
+    for table in all_tables(material.results) if full else ():
+        console.table(table.headings, table.rows, title=table.title, caption=table.caption)
     for text in answer(material, thresholds):
         console.text(text)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from typer import Argument, Option
@@ -70,7 +69,7 @@ def _judge(benchmark: Benchmark, choices: StudyChoices) -> None:
     from esp_cli.studies.symmetry import Trials
     from esp_cli.training.folder_names import FRESH
 
-    out: Path = choices.folder("symmetry")
+    out = choices.folder("symmetry")
     planned, fresh = benchmark.trials, None
     with (
         studying.open_resources(choices, out, benchmark.request.device) as resources,

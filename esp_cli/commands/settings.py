@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated
 
 from typer import Argument
@@ -56,20 +55,15 @@ def _sections(of: str | None) -> Sequence[Section]:
 
 
 def _print(sections: Sequence[Section]) -> None:
-    with console.paged():
-        for section in sections:
-            _print_section(section)
-
-
-def _print_section(section: Section) -> None:
-    prefix = section.settings[0].name.rpartition(".")[0] if section.settings else section.name
-    option = {"task": "--task", "algorithm": "--algo", "network": "--network"}.get(section.kind)
-    title = f"{section.name}: --set {prefix}.NAME=VALUE" + (f", with {option} {section.name}" if option else "")
-    rows = [
-        (one.name.rpartition(".")[2], _written(one.default), one.bounds or one.type, one.unit, _meaning(one))
-        for one in section.settings
-    ]
-    console.table(("setting", "default", "values", "unit", "meaning"), rows, title=title)
+    for section in sections:
+        prefix = section.settings[0].name.rpartition(".")[0] if section.settings else section.name
+        option = {"task": "--task", "algorithm": "--algo", "network": "--network"}.get(section.kind)
+        title = f"{section.name}: --set {prefix}.NAME=VALUE" + (f", with {option} {section.name}" if option else "")
+        rows = [
+            (one.name.rpartition(".")[2], _written(one.default), one.bounds or one.type, one.unit, _meaning(one))
+            for one in section.settings
+        ]
+        console.table(("setting", "default", "values", "unit", "meaning"), rows, title=title)
 
 
 def _meaning(setting: Setting) -> str:
@@ -80,12 +74,6 @@ def _meaning(setting: Setting) -> str:
 
 
 def _written(value: object) -> str:
-    if value is None:
-        return "-"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, float):
-        return f"{value:g}"
-    if isinstance(value, Mapping):
-        return json.dumps(value)
-    return f"[{','.join(map(str, value))}]" if isinstance(value, list | tuple) else str(value)
+    if value is None or isinstance(value, str):
+        return value or "-"
+    return f"{value:g}" if isinstance(value, float) else json.dumps(value, separators=(",", ":"))

@@ -15,25 +15,11 @@ from typer import Option
 
 from esp_cli.commands import options
 from esp_cli.commands.counts import chosen_seeds, parse_count
-from esp_cli.defaults import EPISODES, STUDY_SEEDS
+from esp_cli.defaults import EPISODES, STUDY_SEEDS, Mode
 from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
     from esp_cli.studies.catalogue import Request
-
-
-def changed(annotation: Any, **changes: object) -> Any:
-    """Return an annotation whose option has other attributes, such as its help."""
-    kind, option = get_args(annotation)
-    option = copy.copy(option)
-    vars(option).update(changes)
-    return Annotated[kind, option]
-
-
-if TYPE_CHECKING:
-    StudySeedsOption = tuple[int, ...] | None
-else:
-    StudySeedsOption = changed(options.SeedsOption, show_default=str(len(STUDY_SEEDS)))
 
 
 def parse_names(items: Sequence[str] | None, known: Collection[str] = ()) -> tuple[str, ...] | None:
@@ -83,7 +69,7 @@ class StudyChoices:
             metavar="STEPS",
         ),
     ] = None
-    seeds: StudySeedsOption = None
+    seeds: Annotated[options.Seeds | None, options.seeds_option(len(STUDY_SEEDS))] = None
     seed_list: options.SeedListOption = None
     out: Annotated[Path | None, Option("--out", "-o", help="Study folder; by default runs/STUDY.")] = None
     preset: options.PresetOption = "default"
@@ -122,6 +108,9 @@ class StudyChoices:
     no_check: options.NoCheckOption = False
     json: options.JsonOption = None
     command: str = field(init=False, default="")  # as it was typed
+    # what the study's report states; by default the evaluations and the thresholds of its kind
+    mode: Mode | None = field(init=False, default=None)
+    thresholds: Sequence[float] = field(init=False, default=())
 
     def folder(self, kind: str) -> Path:
         return self.out or Path("runs") / kind
@@ -157,7 +146,10 @@ def study_command(command: Callable[..., None] | None = None, **helps: str) -> C
     del own["choices"]
     shared = dict(inspect.signature(StudyChoices, eval_str=True).parameters)
     for name, text in helps.items():
-        shared[name] = shared[name].replace(annotation=changed(shared[name].annotation, help=text))
+        kind, option = get_args(shared[name].annotation)
+        option = copy.copy(option)
+        option.help = text
+        shared[name] = shared[name].replace(annotation=Annotated[kind, option])
     context = inspect.Parameter("context", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context)
     parameters = sorted([context, *own.values(), *shared.values()], key=lambda one: one.default is not one.empty)
 

@@ -11,7 +11,7 @@ from rich.progress import TaskID
 
 from esp_cli import console
 from esp_cli.console.progress import LiveProgress
-from esp_cli.files.formatting import format_rate
+from esp_cli.files.formatting import format_standing
 
 if TYPE_CHECKING:
     from esp_cli.studies.scheduler import Run, Snapshot
@@ -90,13 +90,7 @@ def run_status(run: Run) -> str:
     """Return steps, rate and time left of a run in one line."""
     if run.status == "evaluating":
         return "playing its final evaluation"
-    steps = f"{console.format_count(run.step)}/{console.format_count(run.cell.config.steps)}"
-    rate = run.rate
-    if rate is None:
-        return steps
-    left_s = (run.cell.config.steps - run.step) * len(run.cell.config.seeds) / rate
-    speed = format_rate(rate, len(run.cell.config.seeds))
-    return f"{steps}  {speed}  {console.format_duration(left_s)} left"
+    return format_standing(run.step, run.cell.config.steps, run.rate, len(run.cell.config.seeds))
 
 
 def whole_status(snapshot: Snapshot) -> str:

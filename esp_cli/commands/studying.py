@@ -22,7 +22,6 @@ from esp_envs.errors import UserError
 from esp_envs.installed import install
 
 if TYPE_CHECKING:
-    from esp_cli.defaults import Mode
     from esp_cli.studies.catalogue import Request
     from esp_cli.studies.engine import Engine
     from esp_cli.studies.forecast import Forecast
@@ -65,20 +64,19 @@ def open_resources(choices: StudyChoices, out: Path, device: str) -> Iterator[Re
 
 
 def run_or_forecast(kind: str, request: Request, choices: StudyChoices) -> None:
-    """Run a study of a kind of `studies.kinds`, or say what that costs, where only that was asked for."""
-    (forecast_study if choices.dry_run else run_study)(kind, request, choices)
-
-
-def run_study(
-    kind: str, request: Request, choices: StudyChoices, mode: Mode | None = None, thresholds: Sequence[float] = ()
-) -> None:
-    """Plan a study, run it, and report it, by default with the mode and the thresholds of its kind."""
-    from esp_cli.studies.catalogue import plan, refuse_untrainable, without_effect
-    from esp_cli.studies.study import StudyFolder
+    """Run and report a study of a kind of `studies.kinds`, or say what it costs, where only that was asked for."""
+    from esp_cli.studies.catalogue import plan, without_effect
 
     out, study = choices.folder(kind), plan(kind, request)
-    refuse_untrainable(study)
     note_without_effect(without_effect(kind, request))
+    (_forecast if choices.dry_run else _run)(out, study, choices)
+
+
+def _run(out: Path, study: Study, choices: StudyChoices) -> None:
+    from esp_cli.studies.catalogue import refuse_untrainable
+    from esp_cli.studies.study import StudyFolder
+
+    refuse_untrainable(study)
     with (
         open_resources(choices, out, study.cells[0].config.device) as resources,
         StudyFolder.held(out),
@@ -89,34 +87,33 @@ def run_study(
         failed = run_cells(folder, study, resources, requests)
     if not requests:
         console.note(f"this took {console.format_duration(time.monotonic() - begun)}")
-    conclude(folder, failed, requests, out, choices, mode, thresholds)
+    conclude(folder, failed, requests, out, choices)
 
 
 def conclude(
-    study: StudyFolder | None,
-    failed: Sequence[str],
-    requests: Sequence[int],
-    out: Path,
-    choices: StudyChoices,
-    mode: Mode | None = None,
-    thresholds: Sequence[float] = (),
+    study: StudyFolder | None, failed: Sequence[str], requests: Sequence[int], out: Path, choices: StudyChoices
 ) -> None:
     """End a command that ran a study in `out`: as stopped, or with the study's report and a word on what failed."""
     if requests:
         raise stopped(choices.command)
     if study is not None:
-        report_study(study, choices.json, mode, thresholds)
+        from esp_cli.commands.report import print_answer
+        from esp_cli.reporting.collect import collect_study
+
+        material = collect_study(study, choices.mode, choices.thresholds)
+        numbers = material.results.document(statistics=True)
+        console.result(choices.json, numbers, lambda: print_answer(material, full=True))
+        first, *others = (cell.config for cell in study.study.cells)
+        limits = (word for limit in choices.thresholds for word in ("--threshold", f"{limit:g}"))
+        console.note(f"next: {shlex.join(['esp', 'report', str(study.path), *first.own_words(*others), *limits])}")
     refuse_failed(failed, out)
 
 
-def forecast_study(kind: str, request: Request, choices: StudyChoices) -> None:
+def _forecast(out: Path, study: Study, choices: StudyChoices) -> None:
     """Say what a study costs; what the study itself would refuse before its first run is refused."""
     from esp_cli.studies import forecast
-    from esp_cli.studies.catalogue import plan, without_effect
     from esp_cli.studies.study import StudyFolder
 
-    out, study = choices.folder(kind), plan(kind, request)
-    note_without_effect(without_effect(kind, request))
     with open_resources(choices, out, study.cells[0].config.device) as resources:
         StudyFolder.planned(out, study)  # refuses the folders that the run would refuse
         with console.TrainingProgress(len(study.cells), description="measure", unit="runs") as progress:
@@ -222,17 +219,3 @@ def refuse_failed(names: Sequence[str], out: Path) -> None:
             f"{len(names)} {runs} failed ({', '.join(names)}); what was said of them is above, and in {LOG} of their "
             f"folders below {out}; the same command tries them again"
         )
-
-
-def report_study(
-    folder: StudyFolder, json: str | None, mode: Mode | None = None, thresholds: Sequence[float] = ()
-) -> None:
-    """Print the tables of a study and what came out, and say what to do next."""
-    from esp_cli.commands.report import print_answer
-    from esp_cli.reporting.collect import collect_study
-
-    material = collect_study(folder, mode, thresholds)
-    console.result(json, material.results.document(statistics=True), lambda: print_answer(material, full=True))
-    first, *others = (cell.config for cell in folder.study.cells)
-    limits = (word for limit in thresholds for word in ("--threshold", f"{limit:g}"))
-    console.note(f"next: {shlex.join(['esp', 'report', str(folder.path), *first.own_words(*others), *limits])}")

@@ -75,14 +75,13 @@ def _print_list(found: list[dict[str, Any]]) -> None:
 
 
 def _print_card(card: dict[str, Any]) -> None:
-    with console.paged():
-        _print_text(card["card"], {row["field"]: row["kind"] for row in card["observation"]})
-        if "| index" not in card["card"]:  # a card of others may lack the table
-            rows = [tuple(row.values()) for row in card["observation"]]
-            console.table(("index>", "field", "kind", "unit"), rows, title="Observation of one agent")
-        settings = [(name, s["default"], s["description"]) for name, s in card["settings"].items()]
-        console.table(("setting", "default", "meaning"), settings, title="Settings (--set task.NAME=VALUE)")
-        console.text(f"Symmetries: {', '.join(card['symmetries'])}")
+    _print_text(card["card"], {row["field"]: row["kind"] for row in card["observation"]})
+    if "| index" not in card["card"]:  # a card of others may lack the table
+        rows = [tuple(row.values()) for row in card["observation"]]
+        console.table(("index>", "field", "kind", "unit"), rows, title="Observation of one agent")
+    settings = [(name, s["default"], s["description"]) for name, s in card["settings"].items()]
+    console.table(("setting", "default", "meaning"), settings, title="Settings (--set task.NAME=VALUE)")
+    console.text(f"Symmetries: {', '.join(card['symmetries'])}")
 
 
 def _print_text(card: str, kinds: dict[str, str]) -> None:

@@ -56,7 +56,7 @@ def train(
         ),
     ] = None,
     steps: options.StepsOption = STEPS,
-    seeds: options.SeedsOption = None,
+    seeds: Annotated[options.Seeds | None, options.seeds_option(len(DEFAULT_SEEDS))] = None,
     seed_list: options.SeedListOption = None,
     out: Annotated[Path | None, Option("--out", "-o", help="Run folder; by default a new one in runs/.")] = None,
     resume: Annotated[Path | None, Option("--resume", help="Continue this run with its own settings.")] = None,
@@ -203,10 +203,8 @@ def _announce(config: RunConfig, path: Path, step: int) -> None:
     if prior.kind != "none":
         symmetry = f"prior {prior.kind} ({prior.transforms}, c = {prior.coefficient:g})"
         if unseen := [name for name, weight in prior.weights.items() if weight == 0]:
-            symmetry += (
-                f", {len(unseen)} of {len(prior.weights)} elements left out, not covered or broken by an unknown "
-            )
-            symmetry += f"size: {', '.join(unseen[:8])}"
+            symmetry += f", {len(unseen)} of {len(prior.weights)} elements left out, not covered or broken "
+            symmetry += f"by an unknown size: {', '.join(unseen[:8])}"
         if broken := [weight for weight in prior.weights.values() if 0 < weight < 1]:
             worth = f"{min(broken):.2g} to {max(broken):.2g}" if min(broken) < max(broken) else f"{broken[0]:.2g}"
             symmetry += f", {len(broken)} of {len(prior.weights)} elements broken and weighed {worth}"

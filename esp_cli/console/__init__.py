@@ -20,12 +20,12 @@ from rich.table import Table
 from rich.text import Text
 
 from esp_cli.console.progress import TrainingProgress, live_progress, watching
-from esp_cli.console.streams import SafeConsole, err, error, fit_encoding, note, out, paged, say, text
+from esp_cli.console.streams import SafeConsole, err, error, fit_encoding, note, out, say, text
 from esp_cli.files.formatting import escaped, format_count, format_duration, format_interval, format_mean, format_span
 from esp_cli.files.writing import write_file
 
 __all__ = ["TrainingProgress", "err", "error", "fit_encoding", "format_count", "format_duration", "format_interval"]
-__all__ += ["format_mean", "format_span", "live_progress", "note", "out", "paged", "say", "text"]  # of its parts
+__all__ += ["format_mean", "format_span", "live_progress", "note", "out", "say", "text"]  # of its parts
 __all__ += ["lay_out", "result", "table", "watching", "write_json"]
 
 _LEAST_TEXT = 14  # columns that a longer text gets at least; narrower ones are hard to read

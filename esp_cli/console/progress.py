@@ -16,7 +16,7 @@ from rich.table import Column
 from rich.text import Text
 
 from esp_cli.console.streams import err, note
-from esp_cli.files.formatting import format_count, format_duration, format_rate
+from esp_cli.files.formatting import format_standing
 
 LINE_INTERVAL_S = 10.0  # seconds between two plain progress lines where standard error is no terminal
 RATE_WINDOW_S = 30.0  # seconds over which the shown rate is averaged
@@ -110,13 +110,8 @@ class TrainingProgress:
 
     def parts(self) -> list[str]:
         """Return steps, rate and time left together, then each metric."""
-        rate = self.rate()
-        left_s = (self.total - self._done) * self.num_seeds / rate if rate > 0 else math.inf
-        return [
-            f"{format_count(self._done)}/{format_count(self.total)}  {format_rate(rate, self.num_seeds, self.unit)}  "
-            f"{format_duration(left_s)} left",
-            *(f"{name} {value:.4g}" for name, value in self._metrics.items()),
-        ]
+        standing = format_standing(self._done, self.total, self.rate(), self.num_seeds, self.unit)
+        return [standing, *(f"{name} {value:.4g}" for name, value in self._metrics.items())]
 
     def _print_line(self) -> None:
         self._shown = self._done

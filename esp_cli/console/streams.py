@@ -9,8 +9,7 @@ import io
 import os
 import sys
 import textwrap
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -97,14 +96,3 @@ def note(text: str) -> None:
 def error(text: str) -> None:
     """Print what went wrong as one line on standard error, whatever line breaks the message came with."""
     err.print(Text.assemble(("error: ", "bold red"), " ".join(text.split())), soft_wrap=True)
-
-
-@contextmanager
-def paged() -> Iterator[None]:
-    """Show what is printed in it through the user's pager, on a terminal and where it is longer than the screen."""
-    if not (out.is_terminal and sys.stdin.isatty()):
-        yield
-        return
-    os.environ.setdefault("LESS", "-FRX")  # colours, nothing that fits the screen, and no empty screen behind it
-    with out.pager(styles=True):
-        yield

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
+import imageio.v3 as iio
 import matplotlib as mpl
-from matplotlib.figure import Figure
 
 from esp_cli.defaults import SLOWEST
 from esp_cli.drawing.figures import INCHES, PAPER, PAPER_DPI, STEADY, saved, summary
-from esp_cli.drawing.films import GIF_FRAMES_PER_SECOND, Frame, frame, write_gif, write_mp4, write_png
+from esp_cli.drawing.films import GIF_FRAMES_PER_SECOND, Frame, frame, write_gif, write_mp4
 from esp_cli.drawing.recording import HOLD_SECONDS, Episode, framed, record
 from esp_cli.files.writing import refuse_unwritable, write_file
 from esp_cli.policies.loading import TrainedPolicy
@@ -77,15 +77,6 @@ class Request:
     def for_print(self) -> bool:
         return self.is_picture and (self.kind != ".png" or self.width is not None)
 
-    @property
-    def inches(self) -> float:
-        return INCHES if self.width is None else self.width / _MM_PER_INCH
-
-    @property
-    def rate(self) -> float:
-        rate = self.fps or FRAMES_PER_SECOND
-        return min(rate, GIF_FRAMES_PER_SECOND) if self.kind == ".gif" else rate
-
 
 @dataclass(frozen=True)
 class Drawing:
@@ -114,7 +105,8 @@ def draw(
         flat = isinstance(painter, TopPainter) and recorded[0][0].scenes[0].picture is None
         recorded = framed(recorded) if flat else recorded
         # steps from one frame to the next: the fewest that keep to the frame rate
-        every = max(1, math.ceil(request.speed / (spec.control_period_s * request.rate) - 1e-9))
+        rate = min(request.fps or FRAMES_PER_SECOND, GIF_FRAMES_PER_SECOND if request.kind == ".gif" else math.inf)
+        every = max(1, math.ceil(request.speed / (spec.control_period_s * rate) - 1e-9))
         taken = shots(recorded, every, spec.control_period_s, spec.name, titles)
         if not request.is_picture:
             report = watch or (lambda *_: None)
@@ -122,22 +114,19 @@ def draw(
             write_film(request.out, painter, taken, step_s, lambda done: report(done, len(taken)))
         elif flat:
             shown = [(own[0], title or spec.name) for own, title in zip(recorded, titles, strict=True)]
-            write_figure(request, lambda: summary(shown, spec.control_period_s, request.inches))
+            style, dpi, inches = {}, request.size / INCHES, INCHES
+            if request.width is not None:
+                style, dpi, inches = PAPER, PAPER_DPI, request.width / _MM_PER_INCH
+            with mpl.rc_context({**style, **STEADY}):
+                content = saved(summary(shown, spec.control_period_s, inches), request.kind[1:], dpi)
+            write_file(request.out, content)
         elif request.for_print:
             raise UserError(f"what draws {spec.name} gives pixels, not lines; name a .png file without --width")
         else:
-            write_png(request.out, taken[-1].draw(painter))
+            write_file(request.out, iio.imwrite("<bytes>", taken[-1].draw(painter), extension=".png"))
     steps = sum(episode.steps for episode in recorded[0])
     returns = tuple(sum(episode.returns[-1] for episode in own) / len(own) for own in recorded)
     return Drawing(request.out, 1 if request.is_picture else len(taken), steps, returns, painter.note)
-
-
-def write_figure(request: Request, make: Callable[[], Figure]) -> None:
-    """Make a figure in the style that was asked for, and write it as PNG, PDF or SVG."""
-    style, dpi = ({}, request.size / INCHES) if request.width is None else (PAPER, PAPER_DPI)
-    with mpl.rc_context({**style, **STEADY}):
-        content = saved(make(), request.kind[1:], dpi)
-    write_file(request.out, content)
 
 
 def _acting(request: Request, policies: Sequence[TrainedPolicy]) -> list[TrainedPolicy]:
@@ -163,14 +152,12 @@ def open_painter(env: Environment, view: View, size: int) -> Iterator[Painter]:
     if own is None and view == "3d":
         raise UserError(f"{env.spec.name} is a flat task without a view in space; leave out --view 3d")
     with ExitStack() as stack:
-        painter: Painter = TopPainter(size)
-        if own is not None:
-            try:
-                painter = stack.enter_context(own)
-            except UserError as error:
-                if view == "3d":
-                    raise
-                painter = TopPainter(size, note=f"{error}; so the view is from above")
+        try:
+            painter: Painter = TopPainter(size) if own is None else stack.enter_context(own)
+        except UserError as error:
+            if view == "3d":
+                raise
+            painter = TopPainter(size, note=f"{error}; so the view is from above")
         yield painter
 
 

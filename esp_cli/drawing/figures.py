@@ -75,9 +75,7 @@ def _way(episode: Episode, width: float) -> tuple[Callable[[SubFigure, Episode, 
 
 def paths(figure: SubFigure, episode: Episode, title: str, _: float) -> None:
     """Draw the paths of an episode as in figure 6c of the paper: a colour for each body, stronger with time."""
-    axes = _axes(figure.add_subplot(), episode.scenes[-1])
-    _title(axes, title)
-    _add_paths(axes, episode)
+    _add_paths(_axes(figure.add_subplot(), episode.scenes[-1], title), episode)
     _add_legend(figure, episode.scenes[-1], started=True)
 
 
@@ -86,8 +84,7 @@ def coverage(figure: SubFigure, episode: Episode, title: str, period_s: float) -
     last = episode.scenes[-1]
     wanted = [k for k, body in enumerate(last.bodies) if body.reach is not None]
     above, below = figure.subplots(2, height_ratios=(_width(figure), _BARS + _BAR * len(wanted)))
-    _title(_axes(above, last), title)
-    _add_paths(above, episode)
+    _add_paths(_axes(above, last, title), episode)
     labels, held = [], [holders(scene) for scene in episode.scenes[1:]]
     for row, k in enumerate(wanted):
         x, y = last.bodies[k].position
@@ -143,18 +140,14 @@ def strip(figure: SubFigure, episode: Episode, title: str, period_s: float) -> N
     _add_legend(figure, episode.scenes[-1], started=False)
 
 
-def _title(axes: Axes, title: str) -> None:
+def _axes(axes: Axes, scene: Scene, title: str = "") -> Axes:
     axes.set_title(title, loc="left", fontsize="medium", fontweight="bold", parse_math=False)
-
-
-def _axes(axes: Axes, scene: Scene) -> Axes:
     x_min, x_max, y_min, y_max = scene.window
     unit = f" ({scene.unit})" if scene.unit else ""
     axes.set(xlim=(x_min, x_max), ylim=(y_min, y_max), xlabel=f"x{unit}", ylabel=f"y{unit}", aspect="equal")
     if scene.grid[1]:  # lines between cells
-        spacing, offset = scene.grid
         for low, high, lines in ((x_min, x_max, axes.set_xticks), (y_min, y_max, axes.set_yticks)):
-            lines(grid_lines(low, high, spacing, offset))
+            lines(grid_lines(low, high, *scene.grid))
         axes.tick_params(length=0)
     axes.grid(color=GRID)
     axes.set_axisbelow(True)

@@ -10,7 +10,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import imageio.v3 as iio
 import numpy as np
 from imageio.v2 import get_writer
 from numpy.typing import NDArray
@@ -29,7 +28,6 @@ _BAR, _TICKS, _SIDE = 2.0, 1.5, 2.6  # height of a bar of text, of the numbers b
 _OVERSAMPLING = 3
 _GAP = 8  # pixels between two pictures
 GIF_FRAMES_PER_SECOND = 50  # players slow down a GIF that is faster
-_GIF_TICK_S = 0.01
 
 
 @dataclass(frozen=True)
@@ -108,11 +106,6 @@ def write_mp4(path: Path, frames: Iterable[Frame], frames_per_second: float) -> 
                 odd = [(0, size % 2) for size in frame.shape[:2]]  # the format asks for even sizes
                 writer.append_data(np.pad(frame, (*odd, (0, 0)), mode="edge"))
         write_file(path, film.read_bytes())
-
-
-def write_png(path: Path, picture: Frame) -> None:
-    """Write one picture."""
-    write_file(path, iio.imwrite("<bytes>", picture, extension=".png"))
 
 
 def _total(episode: Episode) -> str:
@@ -195,6 +188,5 @@ def _ticks(low: float, high: float, spacing: float, scale: float, size: int) -> 
 
 def _milliseconds(seconds: Sequence[float]) -> list[int]:
     """Round to the hundredths that a GIF knows, so that the errors do not add up."""
-    ticks = np.diff(np.rint(np.cumsum(seconds) / _GIF_TICK_S), prepend=0)
-    shortest = 1 / (GIF_FRAMES_PER_SECOND * _GIF_TICK_S)
-    return [round(tick * _GIF_TICK_S * 1000) for tick in np.maximum(ticks, shortest)]
+    hundredths = np.diff(np.rint(100 * np.cumsum(seconds)), prepend=0)
+    return [10 * int(count) for count in np.maximum(hundredths, 100 // GIF_FRAMES_PER_SECOND)]

@@ -20,7 +20,7 @@ from esp_cli.export.onnx_file import onnx_model, onnx_runner
 from esp_cli.export.program import Program, program_of
 from esp_cli.export.templates import RUNTIME, filled
 from esp_cli.export.torch_file import torch_archive, torch_runner
-from esp_cli.files.writing import remove_file, replace_file
+from esp_cli.files.writing import replace_file
 from esp_cli.policies.loading import TrainedPolicy
 from esp_envs.errors import UserError
 
@@ -128,7 +128,7 @@ def _write(files: Files, folder: Path, force: bool) -> None:
         raise UserError(f"{folder} has {taken[0]} already; choose another --out, or replace it with --force")
     for name in _PROGRAMS if taken else ():  # of another policy, in a format that is not written now
         if name not in files:
-            remove_file(folder / name)
+            (folder / name).unlink(missing_ok=True)
     for name, content in files.items():
         replace_file(folder / name, content)
 

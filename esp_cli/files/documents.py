@@ -178,16 +178,13 @@ def parse_value(text: str) -> Any:
 
 
 def _refuse_nesting(value: object) -> None:
-    level = [value]
-    for _ in range(MAX_NESTING):
-        level = [item for outer in level for item in _inside(outer) if isinstance(item, dict | list)]
+    level: list[Any] = [[value]]
+    for _ in range(1 + MAX_NESTING):
+        inside = (outer.values() if isinstance(outer, dict) else outer for outer in level)
+        level = [item for items in inside for item in items if isinstance(item, dict | list)]
         if not level:
             return
     raise UserError(_TOO_DEEP)
-
-
-def _inside(value: object) -> Collection[Any]:
-    return value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

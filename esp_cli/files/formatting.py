@@ -46,11 +46,6 @@ def file_name(text: str) -> str:
     return "-".join(word.strip(".") for word in words if word.strip(".")) or "unnamed"
 
 
-def format_rate(rate: float, num_seeds: int, unit: str = "steps") -> str:
-    """Return the environment steps, or what else is counted, a second of all seeds: (9510, 1) -> "9.51k steps/s"."""
-    return f"{format_count(rate)} {'seed-' if num_seeds > 1 else ''}{unit}/s"
-
-
 def format_span(counts: Collection[int]) -> str:
     """Return the smallest to the largest of some counts, or the one that they all are: {32, 160} -> "32 to 160"."""
     low, high = min(counts), max(counts)
@@ -81,6 +76,15 @@ def format_duration(seconds: float) -> str:
     if whole < 3600:
         return f"{whole // 60} min {whole % 60:02d} s"
     return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+def format_standing(done: int, total: int, rate: float | None, num_seeds: int, unit: str = "steps") -> str:
+    """Return what is done of each seed, and once it is known the rate of all seeds together and the time left."""
+    counts = f"{format_count(done)}/{format_count(total)}"
+    if rate is None:
+        return counts
+    left_s = (total - done) * num_seeds / rate if rate > 0 else math.inf
+    return f"{counts}  {format_count(rate)} {'seed-' if num_seeds > 1 else ''}{unit}/s  {format_duration(left_s)} left"
 
 
 def nearest(text: str, known: Iterable[str]) -> str | None:

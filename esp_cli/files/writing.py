@@ -110,12 +110,6 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Callable[[bytes], None]]
             os.close(entries)
 
 
-def remove_file(path: Path) -> None:
-    """Remove a file if it is there."""
-    with contextlib.suppress(FileNotFoundError):
-        path.unlink()
-
-
 def sync_file(path: Path) -> None:
     """Flush what was appended to a file, if it is there, to the disk."""
     if path.exists():

@@ -27,7 +27,7 @@ from optuna.trial import TrialState
 
 from esp_cli.files.documents import parse_value
 from esp_cli.files.formatting import shortened
-from esp_cli.files.writing import mend_last_line, remove_file, replace_file
+from esp_cli.files.writing import mend_last_line, replace_file
 from esp_cli.studies.run_set import Cell, RefusedError, RunSet
 from esp_cli.studies.tuning import REDUCTION, RUNGS, TUNING_FORMAT, Outcome, Point, Tuning, curve_of, score
 from esp_cli.studies.tuning_space import Dimension, space_of
@@ -192,7 +192,7 @@ class Search(RunSet):
     def end(self, cell: Cell) -> None:
         """Remove what a trial that has ended would go on from; a replay is large."""
         for file in checkpoints_in(self.run_path(cell)):
-            remove_file(file)
+            file.unlink(missing_ok=True)
 
     def outcome(self, prior: str) -> Outcome:
         trials, tuning = self.trials(prior), self.tuning

@@ -24,7 +24,6 @@ from esp_cli.defaults import __version__
 from esp_cli.files.documents import MAX_DOCUMENT_BYTES, DocumentError, DocumentFormat, Strict, parse_object, validate
 from esp_cli.files.formatting import shortened
 from esp_cli.files.opening import open_own, read_regular
-from esp_cli.files.writing import remove_file
 from esp_cli.policies.evaluation import FinalEvaluation
 from esp_cli.studies.run_set import FOLDER_NAME, Cell, RunSet
 from esp_cli.training.config import RunConfig, completed
@@ -167,7 +166,7 @@ class StudyFolder(RunSet):
         if not self.is_trained(cell):
             return super().next_command(cell)
         final = self.evaluation_path(cell)
-        remove_file(final)  # a damaged one is made again, and a link there is not followed
+        final.unlink(missing_ok=True)  # a damaged one is made again, and a link there is not followed
         words = ["eval", str(self.run_path(cell)), "--episodes", str(self.study.episodes), "--json", str(final)]
         return words + cell.config.own_words()
 

@@ -30,7 +30,7 @@ from torch import Tensor
 from esp_cli.files.documents import DocumentFormat
 from esp_cli.files.formatting import attempting
 from esp_cli.files.opening import holding, open_own
-from esp_cli.files.writing import TEMPORARY_PREFIX, remove_file, sync_file
+from esp_cli.files.writing import TEMPORARY_PREFIX, sync_file
 from esp_cli.training.checkpoint import (
     CHECKPOINT_FORMAT,
     POLICY_FORMAT,
@@ -93,7 +93,7 @@ class RunFolder:
                 # a second time, as another process may have made a run here in between
                 _refuse_taken(path)
                 for file in (folder.policy_path, folder.initial_path, *folder.checkpoints(), folder.metrics_path):
-                    remove_file(file)
+                    file.unlink(missing_ok=True)
                 (path / CHECKPOINTS).mkdir(exist_ok=True)
                 os.close(open_own(folder.metrics_path, os.O_WRONLY))
                 if initial is not None:
@@ -120,7 +120,7 @@ class RunFolder:
             with attempting("tidy up", self.path, RunFolderError):
                 for folder in (self.path, checkpoints):
                     for file in folder.glob(f"{TEMPORARY_PREFIX}*"):
-                        remove_file(file)
+                        file.unlink(missing_ok=True)
                 if self.policy_path.is_file():  # a process was killed before it came to this
                     self._remove_superseded()
             yield
@@ -211,7 +211,7 @@ class RunFolder:
                 own = read_description(file).get(RUN_ID) == self.identity
             if own:
                 with attempting("remove", file, RunFolderError):
-                    remove_file(file)
+                    file.unlink(missing_ok=True)
 
 
 def checkpoints_in(run: Path) -> list[Path]:

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from esp_cli import __version__
 from esp_cli.app import app
 from esp_cli.commands import COMMANDS
-from esp_cli.commands.options import SeedsOption, StepsOption
+from esp_cli.commands.options import Seeds, StepsOption, seeds_option
 from esp_envs.errors import UserError
 from tests.cli.test_console import shell
 
@@ -43,7 +43,7 @@ FAILURES: dict[str, BaseException] = {
 def toy(
     kind: Annotated[str, typer.Argument(help="What to do.")] = "fine",
     steps: StepsOption = 500_000,
-    seeds: SeedsOption = (0,),
+    seeds: Annotated[Seeds | None, seeds_option(1)] = None,
 ) -> None:
     """Fail in the way that is asked for."""
     if kind in FAILURES:
@@ -126,7 +126,7 @@ def test_the_traceback_of_a_sentence_can_be_asked_for(commands: None, monkeypatc
             ["toy", "--steps", "many"],
             "'many' is not a number of steps; write for example 20000, 500k or 1.5M (see 'esp toy --help')",
         ),
-        (["toy", "--seeds", "2,2"], "name one seed twice"),
+        (["toy", "--seeds", "2,2"], "does not say how many seeds"),
         (["toy", "--speed", "3"], "No such option: --speed"),
         (["--speed"], "No such option: --speed"),
     ],

@@ -166,18 +166,6 @@ def test_the_live_line_of_a_training_fits_the_terminal_and_says_what_matters(tmp
     assert re.search(r"navigation .*500/500  \S+ steps/s  0 s left  greedy -[\d.]+", live[-1])
 
 
-def test_long_output_goes_through_the_pager_on_a_terminal() -> None:
-    assert "PAGED" in on_terminal("settings", "mappo", PAGER="sed s/^/PAGED/")
-
-
-def test_nothing_is_paged_in_a_pipe(monkeypatch: pytest.MonkeyPatch) -> None:
-    def page(text: str) -> None:
-        raise AssertionError("a pager would wait for a key")
-
-    monkeypatch.setattr("pydoc.pager", page)
-    assert "learning_rate" in esp("settings", "mappo").stdout
-
-
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_fits_80_columns_in_groups_and_h_is_short_for_it(name: str) -> None:
     told = _runner.invoke(app, [name, "-h"], env={"COLUMNS": "80"}).stdout
