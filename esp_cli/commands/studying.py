@@ -69,7 +69,10 @@ def run_or_forecast(kind: str, request: Request, choices: StudyChoices) -> None:
 
     out, study = choices.folder(kind), plan(kind, request)
     note_without_effect(without_effect(kind, request))
-    (_forecast if choices.dry_run else _run)(out, study, choices)
+    if choices.dry_run:
+        _forecast(out, study, choices)
+    else:
+        _run(out, study, choices)
 
 
 def _run(out: Path, study: Study, choices: StudyChoices) -> None:
