@@ -53,9 +53,9 @@ class Case:
 
     def words(self, run: int, chosen: Sequence[str] = ()) -> list[str]:
         """Return the words behind `esp train` of one run, numbered from 0, with options of the caller behind them."""
-        seeds = "".join(f"{run * self.seeds + k}," for k in range(self.seeds))
+        seeds = ",".join(str(run * self.seeds + k) for k in range(self.seeds))
         evaluation = {"every_steps": self.every, "episodes": self.episodes // self.seeds}
-        words = [*self.options.split(), "--seeds", seeds, "--steps", str(self.steps)]
+        words = [*self.options.split(), "--seed-list", seeds, "--steps", str(self.steps)]
         words += [word for name, value in evaluation.items() for word in ("--set", f"evaluation.{name}={value}")]
         return [*words, *chosen]
 

@@ -28,8 +28,8 @@ def test_a_run_is_solved_by_the_mean_of_an_evaluation_over_all_seeds() -> None:
 
 def test_every_run_has_seeds_of_its_own_and_the_callers_options_have_the_last_word() -> None:
     case = Case("--task navigation", seeds=2, threshold=0.0)
-    assert case.words(0)[:4] == ["--task", "navigation", "--seeds", "0,1,"]
-    assert case.words(3)[3] == "6,7,"
+    assert case.words(0)[:4] == ["--task", "navigation", "--seed-list", "0,1"]
+    assert case.words(3)[3] == "6,7"
     assert "evaluation.episodes=160" in case.words(0), "320 over both seeds"
     assert case.words(0, ["--preset", "paper"])[-2:] == ["--preset", "paper"]
 

@@ -59,7 +59,7 @@ def test_a_tracker_that_fails_is_one_line_and_the_run_goes_on(finished, tmp_path
     monkeypatch.setattr(Failing, "way", way)
     monkeypatch.setattr(Failing, "rows", 0)
     monkeypatch.setattr(Failing, "closed", 0)
-    words = ["--network", "mlp", *TINY_OPTIONS, *STEPS, "--seeds", "3,7", "--track", "wandb"]
+    words = ["--network", "mlp", *TINY_OPTIONS, *STEPS, "--seed-list", "3,7", "--track", "wandb"]
     told = esp("train", *words, "--out", tmp_path / "run")
     sentence = f"tracking with wandb ended: it cannot {way} (the server); the run goes on"
     assert told.stderr.splitlines().count(sentence) == 1
@@ -164,7 +164,7 @@ def test_a_real_tracker_holds_what_the_metrics_file_holds_and_writes_nowhere_els
     home, work = tmp_path / "home", tmp_path / "work"
     home.mkdir()
     work.mkdir()
-    command = ["train", *TINY_OPTIONS, *STEPS, "--seeds", "3,7", "--track", name, "--out", "run"]
+    command = ["train", *TINY_OPTIONS, *STEPS, "--seed-list", "3,7", "--track", name, "--out", "run"]
     environment = {key: value for key, value in os.environ.items() if not key.startswith(("WANDB", "MLFLOW", "XDG"))}
     environment |= {"HOME": str(home), "PYTHONDONTWRITEBYTECODE": "1"}
     environment["PYTHONPATH"] = os.pathsep.join(
@@ -193,7 +193,7 @@ def test_a_resumed_run_is_one_run_for_its_tracker(tmp_path: Path, name: str, mon
     if not trackers.find_spec(name):
         pytest.skip(f"{name} is not installed; .ci/run installs it")
     monkeypatch.setenv("HOME", str(tmp_path))
-    run = train_tiny(tmp_path / "run", "--seeds", "3,7", "--track", name, steps=100)
+    run = train_tiny(tmp_path / "run", "--seed-list", "3,7", "--track", name, steps=100)
     file = run / ("wandb" if name == "wandb" else "mlruns") / "run-id"
     known = file.read_text()
     for checkpoint in (run / "checkpoints").iterdir():
