@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageColor, ImageDraw, ImageFont, ImageOps
+from PIL import Image, ImageColor, ImageDraw, ImageFont
 
 from esp_envs.errors import UserError
 from esp_envs.scene import DARK, Body, Scene, holders
@@ -39,7 +39,9 @@ def draw(scene: Scene, size: int = 320, trail: Sequence[Scene] = ()) -> NDArray[
     if size < 16 or x_max <= x_min or y_max <= y_min:
         raise UserError(f"cannot draw the window {scene.window} on {size} pixels; use a real window and 16 or more")
     if scene.picture is not None:
-        return np.asarray(ImageOps.contain(Image.fromarray(scene.picture), (size, size)))
+        whole = Image.fromarray(scene.picture)
+        share = size / max(whole.size)
+        return np.asarray(whole.resize((max(1, round(whole.width * share)), max(1, round(whole.height * share)))))
     canvas = _Canvas(scene.window, size)
     canvas.grid(*scene.grid)
     for body, path in trails(scene, trail):

@@ -171,8 +171,9 @@ class _Pairs:
         def apart() -> list[Outcomes]:
             return [self._there(transform, twin, seed) for twin, seed in enumerate(_THERE)]
 
+        first, second, near = self._images(transform)
         try:
-            first, second, alike, near = self._sides(transform)
+            alike = self._there(transform, 0, _HERE[0])
             verdicts = [
                 self._unseen(name, first, alike)
                 or state_by_state(name, first, second, alike, near)
@@ -190,11 +191,13 @@ class _Pairs:
 
         None where chance or rounding decides some field, and none is broken, or the task raises.
         """
+        transform = self._transform(element)
+        first, second, near = self._images(transform)
         try:
-            sides = self._sides(self._transform(element))
+            alike = self._there(transform, 0, _HERE[0])
         except (Exception, SystemExit):
             return None
-        first, rows = sides[0], self._visited[0][0].shape[1] * _LATER_OF_SLOW
+        sides, rows = (first, second, alike, near), self._visited[0][0].shape[1] * _LATER_OF_SLOW
         # in either half of the worlds: an event that rounding tips in one of them is no breaking
         halves = [[{name: row[:rows][k::2] for name, row in side.items()} for side in sides] for k in (0, 1)]
         verdicts = {name: [state_by_state(name, *half) for half in halves] for name in first}
@@ -211,10 +214,8 @@ class _Pairs:
     def _transform(self, element: Element | Shift) -> Transform | Unmoved:
         return element if isinstance(element, Shift) else build_transform([element], self._spec)
 
-    def _sides(self, transform: Transform | Unmoved) -> tuple[Outcomes, Outcomes, Outcomes, Outcomes]:
-        """Return what `state_by_state` compares."""
-        first, second, near = (by_field(steps, self._spec, transform) for steps in self._here)
-        return first, second, self._there(transform, 0, _HERE[0]), near
+    def _images(self, transform: Transform | Unmoved) -> list[Outcomes]:
+        return [by_field(steps, self._spec, transform) for steps in self._here]
 
     def _there(self, transform: Transform | Unmoved, twin: int, seed: int) -> Outcomes:
         """Return outcomes of the images."""

@@ -88,7 +88,7 @@ def _read(path: Path, name: str, value: Any) -> Any:
         if name == "steps" and type(value) in (int, str):
             return parse_count(value)
         if name == "seeds" and type(value) in (int, str):
-            return parse_seeds(value)
+            return parse_seed_list(value) if "," in str(value) else parse_seeds(value)
         if name == "seeds" and isinstance(value, list):
             return parse_seed_list(value)
     except UserError as error:

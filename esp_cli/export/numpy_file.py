@@ -33,7 +33,12 @@ def numpy_runner(file: Path) -> Runner:
     policy = runpy.run_path(str(file))["POLICY"]
 
     def run(sample: Sample) -> tuple[Numbers, Numbers, Numbers]:
-        action, after = policy.step(sample.obs, sample.memory, sample.mask, sample.sets)
-        return action, policy.outputs(sample.obs, sample.memory, sample.sets)[0], after
+        count, team = len(sample.obs), policy.program["team"]
+        lead = (count // team, team) if team > 1 else (count,)
+        obs, memory = (rows.reshape(*lead, rows.shape[1]) for rows in (sample.obs, sample.memory))
+        mask = None if sample.mask is None else sample.mask.reshape(*lead, sample.mask.shape[1])
+        results = (*policy.step(obs, memory, mask, sample.sets), policy.outputs(obs, memory, sample.sets)[0])
+        action, after, outputs = (rows.reshape(count, *rows.shape[len(lead) :]) for rows in results)
+        return action, outputs, after
 
     return run

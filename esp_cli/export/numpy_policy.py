@@ -59,7 +59,7 @@ class NumpyPolicy:
         x, memory = np.asarray(obs, np.float32), np.asarray(memory, np.float32)
         if x.shape[-1:] != (self.program["num_inputs"],):
             raise ValueError(f"the observation has shape {x.shape}, but (..., {self.program['num_inputs']}) is needed")
-        if (team := self.program["team"]) > 1 and (x.ndim < 2 or x.shape[-2] % team):
+        if (team := self.program["team"]) > 1 and x.shape[-2:-1] != (team,):
             raise ValueError(f"the observation has shape {x.shape}, but (..., {team}, D) is needed")
         if memory.shape != (*x.shape[:-1], self.hidden + self.previous):
             raise ValueError(f"the memory has shape {memory.shape}, but initial_memory{x.shape[:-1]} is needed")

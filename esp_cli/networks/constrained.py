@@ -185,9 +185,9 @@ class Equivariant(Memoryless):
         def vjp_of_free(slope: Tensor) -> list[Tensor]:
             made = zip(plain, vjp(slope.reshape(outputs.shape)), strict=True)
             learned, by_learned = zip(*((x, by_x) for x, by_x in made if x.requires_grad), strict=True)
-            return [*torch.autograd.grad(learned, self.learned, by_learned)]
+            return [*torch.autograd.grad(learned, self._all_parameters, by_learned)]
 
-        return WithVJP(outputs.reshape(shape), vjp_of_free, self.learned)
+        return WithVJP(outputs.reshape(shape), vjp_of_free, self._all_parameters)
 
     def _plain(self) -> list[Tensor]:
         """Return weights and biases of the plain perceptron that this one is, in the order of `perceptron`."""

@@ -173,7 +173,7 @@ class Network(nn.Module, ABC):
         return self.unroll(rows.flatten(1, 2), truncation).unflatten(1, rows.shape[1:3]).transpose(2, 3)
 
     @cached_property
-    def learned(self) -> list[Tensor]:
+    def _all_parameters(self) -> list[Tensor]:
         """All parameters; to list them takes as long as a product."""
         return [*self.parameters()]
 
@@ -186,9 +186,11 @@ class Network(nn.Module, ABC):
 
         def vjp(slope: Tensor) -> list[Tensor]:
             above = slope.reshape(outputs.shape)
-            return [*torch.autograd.grad(outputs, self.learned, above, allow_unused=True, materialize_grads=True)]
+            return [
+                *torch.autograd.grad(outputs, self._all_parameters, above, allow_unused=True, materialize_grads=True)
+            ]
 
-        return WithVJP(outputs.detach().reshape(shape), vjp, self.learned)
+        return WithVJP(outputs.detach().reshape(shape), vjp, self._all_parameters)
 
 
 class WithVJP:

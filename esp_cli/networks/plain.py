@@ -114,9 +114,9 @@ class MLP(SeedMLP, Memoryless):
         if self.norms is not None:
             return super().with_vjp(x, shape, truncation)
         if defer and computes(self.compiled, x):
-            return Deferred(self._shape(), x, self.learned, shape)
-        outputs, vjp = perceptron_with_vjp(self._shape(), [x], self.learned)
-        return WithVJP(outputs.reshape(shape), lambda slope: vjp(slope.reshape(outputs.shape)), self.learned)
+            return Deferred(self._shape(), x, self._all_parameters, shape)
+        outputs, vjp = perceptron_with_vjp(self._shape(), [x], self._all_parameters)
+        return WithVJP(outputs.reshape(shape), lambda slope: vjp(slope.reshape(outputs.shape)), self._all_parameters)
 
 
 class GRU(Network):

@@ -17,6 +17,7 @@ from esp_cli.networks.contract import WithVJP
 from esp_cli.networks.kernels.choices import Clipped, Slope, divergences
 from esp_cli.networks.perceptron import Deferred
 from esp_cli.symmetry.frame import Frame
+from esp_envs.errors import UserError
 
 _HALF_LOG_TAU = 0.5 * math.log(2 * math.pi)
 
@@ -113,7 +114,10 @@ class CompiledCategoricalPolicies:
 
     def add_clipped_slope(self, slope: Slope | None, clipped: Clipped) -> Slope:
         """Add the slope of a clipped objective and of entropies, one of each."""
-        return (slope or Slope())._replace(clipped=clipped)
+        before = slope or Slope()
+        if before.clipped is not None:
+            raise UserError("a kernel takes one clipped objective of the same outputs; set network.compiled=false")
+        return before._replace(clipped=clipped)
 
     def add_divergence_slope(self, slope: Slope | None, weights: Weights) -> Slope:
         before = slope or Slope()

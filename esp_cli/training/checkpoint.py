@@ -112,10 +112,11 @@ def _storable(path: str | os.PathLike[str], tensors: Mapping[str, Tensor]) -> di
     stored: dict[str, Tensor] = {}
     storages: set[int] = set()
     for name, tensor in tensors.items():
-        if tensor.layout != torch.strided or not _is_readable(tensor):
+        if not isinstance(tensor, Tensor) or tensor.layout != torch.strided or not _is_readable(tensor):
+            found = getattr(tensor, "dtype", type(tensor).__name__)
             raise CheckpointError(
                 f"cannot write {path}: '{name}' is no dense tensor of a storable dtype and at most {_MAX_DIMENSIONS} "
-                f"dimensions ({tensor.dtype})"
+                f"dimensions ({found})"
             )
         dense = tensor.detach().cpu().contiguous()
         if dense.untyped_storage().data_ptr() in storages:

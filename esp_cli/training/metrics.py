@@ -154,10 +154,11 @@ class Metrics(Shown, dict[str, Floats]):
             for name, value in row.items():
                 if name == "step":
                     continue
-                columns = len(self.seeds) if isinstance(value, list) else 1
-                self._whole |= set() if isinstance(value, list) else {name}
-                array = self.setdefault(name, np.full((len(rows), columns), math.nan))
-                array[index] = np.array(value, dtype=np.float64)
+                if name not in self:
+                    columns = len(self.seeds) if isinstance(value, list) else 1
+                    self._whole |= set() if isinstance(value, list) else {name}
+                    self[name] = np.full((len(rows), columns), math.nan)
+                self[name][index] = np.array(value, dtype=np.float64)
 
     def _facts(self) -> Mapping[str, object]:
         """Return what there is, and the newest mean over seeds of what was evaluated."""

@@ -26,6 +26,7 @@ from esp_cli.prior import Loss, PriorConfig, SeedBatch, SymmetryPrior, copies, m
 from esp_cli.prior.losses import value_consistency_loss
 from esp_cli.symmetry import transform_set
 from esp_envs import Field, Kind, Spaces, layout
+from esp_envs.errors import UserError
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Continuous, Discrete, Layout
 from tests.algorithms import off_policy as learners
 from tests.algorithms.test_mappo import learner
@@ -313,6 +314,24 @@ def test_losses_add_up_with_each_other_and_with_tensors_and_take_weights():
     ((parameters, (by,)),) = loss.gradients([weight])
     assert parameters[0] is weight
     assert by.tolist() == [[4 * 3 + 1], [-4 + 1]]
+
+
+@pytest.mark.parametrize("compiled", [False, pytest.param(True, marks=needs_compiler)])
+def test_two_clipped_objectives_of_the_same_outputs_add_up_or_are_refused_by_a_kernel(compiled):
+    trained = learner(network__compiled=compiled, prior__kind="none")
+    made, seen = prepared(trained), []
+
+    def by(*clips):
+        outputs = trained.policy.unroll_with_vjp(made.obs)
+        seen.append(outputs)  # copies know outputs by their identity
+        losses = [ppo_loss(trained.policy.head, outputs, made, clip, 0.01) for clip in clips]
+        return trained.optimiser.gradient(sum(losses[1:], start=losses[0]))
+
+    if compiled:
+        with pytest.raises(UserError, match=r"one clipped objective of the same outputs; set network\.compiled=false"):
+            by(0.2, 0.05)
+    else:
+        torch.testing.assert_close(by(0.2, 0.05), by(0.2) + by(0.05))
 
 
 def test_every_gradient_of_a_default_run_goes_through_the_equations(monkeypatch):

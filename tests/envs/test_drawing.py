@@ -78,3 +78,11 @@ def test_the_painter_draws_the_same_as_the_function() -> None:
 def test_nothing_to_draw_on_is_refused(window: tuple[float, float, float, float], size: int) -> None:
     with pytest.raises(ValueError, match="cannot draw"):
         draw(Scene((), window), size)
+
+
+@pytest.mark.parametrize(
+    ("shape", "drawn"), [((1, 1000, 3), (1, 64, 3)), ((1000, 1, 3), (64, 1, 3)), ((48, 64, 3), (48, 64, 3))]
+)
+def test_a_foreign_picture_keeps_its_shape_and_at_least_a_pixel(shape, drawn):
+    picture = np.zeros(shape, np.uint8)
+    assert draw(Scene((), (0, shape[1], 0, shape[0]), picture=picture), 64).shape == drawn

@@ -128,7 +128,8 @@ def runner_of(program: Program) -> check.Runner:
     policy = numpy_policy(program)
 
     def run(sample):
-        outputs = policy.outputs(sample.obs, sample.memory)[0]
+        worlds = sample.obs.reshape(-1, program.team, program.num_inputs)
+        outputs = policy.outputs(worlds, np.zeros((*worlds.shape[:2], 0)))[0].reshape(len(sample.obs), -1)
         return outputs.argmax(1), outputs, sample.memory
 
     return run
@@ -167,7 +168,7 @@ def test_the_worked_example_is_a_whole_world(tmp_path: Path) -> None:
 def test_an_exported_team_refuses_rows_that_are_no_world(tmp_path: Path) -> None:
     policy = numpy_policy(program_of(drawn_policy("team").policy))
     assert policy.act(np.zeros((2, 3, WIDTH))).shape == (2, 3)
-    for shape in ((WIDTH,), (2, WIDTH), (3, 2, WIDTH)):
+    for shape in ((WIDTH,), (2, WIDTH), (3, 2, WIDTH), (6, WIDTH)):
         with pytest.raises(ValueError, match=r"the observation has shape .* but \(\.\.\., 3, D\) is needed"):
             policy.act(np.zeros(shape))
 

@@ -97,6 +97,7 @@ def test_policy_files_have_their_description_at_the_top_level(tmp_path):
         ({}, {"text": "x" * (5 * 2**20)}, "larger than a reader accepts"),
         ({"a": torch.zeros(2, dtype=torch.complex64)}, {}, "'a' is no dense tensor"),
         ({"a": torch.eye(2).to_sparse()}, {}, "'a' is no dense tensor"),
+        ({"a": 3}, {}, r"'a' is no dense tensor .* \(int\)"),
         ({"a": torch.zeros([1] * 17)}, {}, "at most 16 dimensions"),
     ],
 )

@@ -244,7 +244,9 @@ class Formation(BatchedTask):
 
     def _to_save(self) -> dict[str, Tensor]:
         arrays = {name: getattr(self, f"_{name}") for name in _REMEMBERED}
-        arrays |= {f"physics.{name}": array for name, array in self.physics.state_dict().items()}
+        physics = self.physics.state_dict()
+        arrays |= {name: physics[name] for name in ("mass", "friction")}  # as runs that were begun before have them
+        arrays |= {f"physics.{name}": array for name, array in physics.items()}
         return {name: torch.from_numpy(array) for name, array in arrays.items()}
 
     def _take_back(self, saved: dict[str, Tensor]) -> None:
