@@ -10,6 +10,7 @@ from typing import Literal
 
 import torch
 from torch import Tensor, nn
+from torch.autograd import Function
 from torch.nn.functional import elu
 
 from esp_cli.networks.contract import Generators
@@ -149,8 +150,45 @@ class MonotonicMixer(nn.Module):
 
     def _mixed(self, own: Tensor, seen: Tensor) -> Tensor:
         """Return the team's values [S, B] of own [S, B, N] in states as they are seen [S, B, width]."""
-        rows = self.hypernetwork(seen, rows_innermost=True).transpose(1, 2)
-        first, bias, second, offset = rows.split((self.num_agents * self.width, self.width, self.width, 1), 1)
-        weighed = first.unflatten(1, (self.num_agents, self.width)).abs() * own.transpose(1, 2).unsqueeze(2)
-        hidden = elu(weighed.sum(1) + bias)
-        return (hidden * second.abs()).sum(1) + offset.squeeze(1)
+        rows = self.hypernetwork(seen, rows_innermost=True)
+        return _Mixed.apply(own.transpose(1, 2), rows.transpose(1, 2), self.width)  # type: ignore[no-untyped-call]
+
+
+class _Mixed(Function):
+    """Q_tot with its slopes: own [S, N, B] and rows [S, N M + 2 M + 1, B] of the hypernetwork to [S, B].
+
+    Autograd through the formula takes five times as long, a tenth of a gradient step, and is the reference in the
+    tests.
+    """
+
+    @staticmethod
+    def forward(ctx, own, rows, width):  # type: ignore[no-untyped-def]
+        first, bias, second, offset = _weights(rows, own.shape[1], width)
+        hidden = bias
+        for weight, value in zip(first.unbind(1), own.unsqueeze(2).unbind(1), strict=True):
+            hidden = torch.addcmul(hidden, weight.abs(), value)
+        hidden = elu(hidden, inplace=True)
+        ctx.save_for_backward(own, rows, hidden)
+        return (hidden * second.abs()).sum(1).add_(offset.squeeze(1))
+
+    @staticmethod
+    def backward(ctx, grad):  # type: ignore[no-untyped-def]
+        own, rows, hidden = ctx.saved_tensors
+        by_rows, sizes = torch.empty_like(rows), (own.shape[1], hidden.shape[1])
+        first, _, second, _ = _weights(rows, *sizes)
+        by_first, by_bias, by_second, by_offset = _weights(by_rows, *sizes)
+        by_offset.copy_(grad.unsqueeze(1))
+        torch.sgn(second, out=by_second).mul_(by_offset)
+        by_hidden = by_second * second
+        by_second.mul_(hidden)
+        torch.ops.aten.elu_backward.grad_input(by_hidden, 1.0, 1.0, 1.0, True, hidden, grad_input=by_bias)
+        torch.sgn(first, out=by_first).mul_(by_bias.unsqueeze(1))
+        by_own = (by_first * first).sum(2)
+        by_first.mul_(own.unsqueeze(2))
+        return by_own, by_rows, None
+
+
+def _weights(rows: Tensor, num_agents: int, width: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return W_1 [S, N, M, B], b_1 [S, M, B], w_2 [S, M, B] and b_2 [S, 1, B]."""
+    first, bias, second, offset = rows.split((num_agents * width, width, width, 1), 1)
+    return first.unflatten(1, (num_agents, width)), bias, second, offset

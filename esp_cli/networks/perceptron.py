@@ -59,7 +59,10 @@ def passed(make: Callable[..., Any], inputs: Sequence[Tensor], parameters: Seque
 def perceptron_with_vjp(
     shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor]
 ) -> tuple[Tensor, Callable[[Tensor], list[Tensor]]]:
-    """Return what `perceptron` does, without a graph, and its VJP; nothing may change in place before that is used."""
+    """Return what `perceptron` does, without a graph, and its VJP, to be called where no graph is made either.
+
+    Nothing may change in place before that is used.
+    """
     with torch.no_grad():
         run = _pass(shape, inputs, parameters, keep=True)
     return run.outputs.unflatten(1, inputs[0].shape[1:-1]), lambda slope: run.backward(slope.flatten(1, -2))
@@ -102,8 +105,12 @@ def _pass(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor], 
 
 def _pieces(shape: Shape, inputs: Sequence[Tensor]) -> Iterator[Tensor]:
     """Return rows whose numbers lie side by side, some at a time."""
-    for parts in zip(*(x.split(_size(x), 1) for x in inputs), strict=True):
+    for parts in zip(*(_split(x, _size(x)) for x in inputs), strict=True):
         yield (parts[0] if len(parts) == 1 else torch.cat(parts, -1)).to(shape.precision)
+
+
+def _split(x: Tensor, size: int) -> Sequence[Tensor]:
+    return x.split(size, 1) if x.shape[1] > size else (x,)
 
 
 def _size(x: Tensor) -> int:
@@ -143,8 +150,7 @@ class _Pass:
         self.outputs = _joined([run[-1] for run in self._runs])
 
     def backward(self, grad: Tensor) -> list[Tensor]:
-        with torch.no_grad():
-            grads, _ = self.backward_to(grad, [True] * (2 * len(self._weights)), [])
+        grads, _ = self.backward_to(grad, [True] * (2 * len(self._weights)), [])
         return [g for g in grads if g is not None]
 
     def backward_to(
@@ -155,7 +161,7 @@ class _Pass:
         grads: list[Tensor | None] = [None] * (2 * len(weights))
         below: list[list[Tensor]] = [[] for _ in asked]
         columns = list(zip(asked, pairwise(accumulate(self._widths, initial=0)), below, strict=False))
-        for run, upper in zip(self._runs, grad.to(shape.precision).split(self._size, 1), strict=True):
+        for run, upper in zip(self._runs, _split(grad.to(shape.precision), self._size), strict=True):
             here = _backward(shape, run, upper, weights, learns, grads)
             for wanted, (begin, end), parts in columns:
                 if wanted:

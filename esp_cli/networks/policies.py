@@ -134,9 +134,8 @@ class CompiledCategoricalPolicies:
 def _places(orders: Tensor) -> Tensor:
     """Return where, among rows [S A P] of outputs, those of the originals' actions are that orders [S, P, A] give."""
     num_seeds, num_parts, num_actions = orders.shape
-    seeds, parts = (torch.arange(count, device=orders.device) for count in (num_seeds, num_parts))
-    first = (num_actions * num_parts * seeds).view(-1, 1, 1) + parts
-    return torch.add(first, orders.transpose(1, 2), alpha=num_parts).flatten()
+    rows = torch.arange(orders.numel(), device=orders.device).view(num_seeds, num_actions, num_parts)
+    return rows.gather(1, orders.transpose(1, 2)).flatten()
 
 
 def _index(action: Tensor, learned: int) -> Tensor:

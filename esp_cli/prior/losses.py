@@ -75,32 +75,31 @@ class Loss:
     __rmul__ = __mul__
 
     @property
+    @torch.no_grad()
     def value(self) -> Tensor:
         """[S], or [] where nothing depends on the seed."""
         total = torch.zeros(())
         for weight, elements, share in self._evaluate()[0]:
-            with torch.no_grad():
-                x = elements()
+            x = elements()
             total = total + weight * (x if share is None else average(x, share))
         return total
 
     def gradients(self, parameters: Sequence[Tensor]) -> list[tuple[Sequence[Tensor], list[Tensor]]]:
         """Return learned parameters, maybe again, and gradients of each seed's loss by each [S, ...] or all [S, P]."""
         found: list[tuple[Sequence[Tensor], list[Tensor]]] = []
-        graphs: list[Tensor] = []
-        for root, slope in self._evaluate()[1]:
-            if not isinstance(root, OfGraph):
-                found.append((root.parameters, root.vjp(slope)))
-            elif root.graph.requires_grad:
-                graphs.append(_WithSlope.apply(root.graph, slope))  # type: ignore[no-untyped-call]
+        graphs: list[tuple[Tensor, Tensor]] = []
+        with torch.no_grad():
+            for root, slope in self._evaluate()[1]:
+                if not isinstance(root, OfGraph):
+                    found.append((root.parameters, root.vjp(slope)))
+                elif root.graph.requires_grad:
+                    graphs.append((root.graph, slope))
         if graphs:
-            by = torch.autograd.grad(
-                sum(graphs[1:], start=graphs[0]), parameters, allow_unused=True, materialize_grads=True
-            )
+            total = sum(_WithSlope.apply(*pair) for pair in graphs)  # type: ignore[no-untyped-call]
+            by = torch.autograd.grad(total, parameters, allow_unused=True, materialize_grads=True)
             found.append((parameters, [*by]))
         return found
 
-    @torch.no_grad()
     def _evaluate(self) -> tuple[list[tuple[float, Any, Tensor | float | None]], list[tuple[Any, Tensor]]]:
         stated, sums = [], dict[int, tuple[Any, Any]]()
         for on, weight, equation in self.terms:

@@ -70,8 +70,9 @@ class SeedBatch:
 
     def chunks(self: Rows, size: int) -> list[Rows]:
         """Cut the batch axis into pieces of at most `size`; views."""
-        pieces = zip(*(tensor.split(size, 1) for tensor in self.tensors.values()), strict=True)
-        return [type(self)(**dict(zip(self.tensors, piece, strict=True))) for piece in pieces]
+        tensors = self.tensors
+        pieces = zip(*(tensor.split(size, 1) for tensor in tensors.values()), strict=True)
+        return [type(self)(**dict(zip(tensors, piece, strict=True))) for piece in pieces]
 
     def transformed(self: Rows, g: Transform) -> Rows:
         """Return (L_g s, K_g a); all else stays (Eq. 5, Prop. 1), or moves with its agents."""

@@ -1,12 +1,13 @@
 """Measure how fast this working tree trains against an older commit, on this machine.
 
-    python tests/benchmarks/against.py [--commit 1b792e9] [--rounds 5] [--cases NAME ...] [--set NAME=VALUE ...]
+    python tests/benchmarks/against.py [--commit 0f974cc] [--rounds 5] [--cases NAME ...] [--set NAME=VALUE ...]
                                        [--json ratios.json]
 
-The older commit is checked out beside the working tree, in a temporary folder. Each round runs every case once with the
-old and once with the new code, each in a process of its own. A case of training is `esp train`; its rate is the median
-over its iterations, taken from the times in metrics.jsonl. The figure of a case is the median over the rounds of
-new / old; above 1 the working tree is faster. Ratios mean something on an idle machine only.
+The older commit is checked out beside the working tree, in a temporary folder. Each code runs in processes of its own.
+A case of training is `esp train` of both, which take turns, an iteration each, so that a machine whose speed drifts is
+the same for both; a round has some turns. Other cases run once a round with the old and once with the new code. The
+figure of a case is the median over all turns of new / old; above 1 the working tree is faster. Ratios mean something on
+an idle machine only.
 """
 
 import argparse
@@ -17,67 +18,153 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from fnmatch import fnmatch
-from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
 ROOT = Path(__file__).parents[2]
-WARM_UP = 2
-"""Iterations at the start of a run that do not count."""
+WARM_UP, TURNS = 3, 8
+"""Iterations at the start of a run that do not count, and those of a round."""
 ESP = ("-c", "from esp_cli.app import main; main()")
+IN_TURNS = """
+import os, sys
+from esp_cli.algorithms import mappo, off_policy
+from esp_cli.app import main
+
+ready = os.fdopen(os.dup(1), "w")
+os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+
+def in_turns(iterate):
+    def turn(*arguments):
+        print("ready", file=ready, flush=True)
+        if not sys.stdin.readline():
+            os._exit(0)
+        return iterate(*arguments)
+    return turn
+
+for learner in (mappo.Mappo, off_policy.OffPolicyLearner):
+    learner.iterate = in_turns(learner.iterate)
+main()
+"""
+"""`esp train` that waits for a line before each iteration."""
 NO_EVALUATION = "--set evaluation.every_steps=1000000000 --set evaluation.episodes=1"
+
+
+Rates = dict[str, list[float]]  # seed-steps per second of the "old" and the "new" code
 
 
 @dataclass(frozen=True)
 class Training:
-    """A run of `esp train`.
+    """`esp train`, iteration by iteration.
 
     Attributes:
         options: of the command line.
         seeds: trained at once.
-        steps: environment steps per seed.
-        end_to_end: divide by the time of the whole process, evaluation and start included.
+        per_iteration: environment steps per seed of an iteration.
     """
 
     options: str
     seeds: int
-    steps: int
-    end_to_end: bool = False
+    per_iteration: int
+
+    def compare(self, trees: Mapping[str, Path], rounds: int, chosen: Sequence[str]) -> Rates:
+        """Return the rates of all turns, with more options behind those of the case for the new code."""
+        done = self.seeds * self.per_iteration
+        with ExitStack() as stack:
+            runs = {
+                side: stack.enter_context(self._started(tree, chosen if side == "new" else ()))
+                for side, tree in trees.items()
+            }
+            rates: Rates = {side: [] for side in runs}
+            for turn in range(WARM_UP + TURNS * rounds):
+                for side in list(runs) if turn % 2 else reversed(runs):  # so that neither side gains by its place
+                    rates[side].append(done / _take_turn(runs[side]))
+        return {side: values[WARM_UP:] for side, values in rates.items()}
+
+    @contextmanager
+    def _started(self, tree: Path, chosen: Sequence[str]) -> Iterator[subprocess.Popen[str]]:
+        words = ("train", *self.options.split(), *NO_EVALUATION.split(), "--seeds", str(self.seeds), *chosen)
+        with tempfile.TemporaryDirectory() as folder:
+            run = subprocess.Popen(
+                [sys.executable, "-c", IN_TURNS, *words, "--steps", "1M", "--out", "run"],
+                cwd=folder,
+                env=paths(tree),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+            try:
+                _await(run)
+                yield run
+            finally:
+                run.kill()
+                run.communicate()
+
+
+def _take_turn(run: subprocess.Popen[str]) -> float:
+    """Let a run do an iteration and return the seconds that it took."""
+    begin = time.perf_counter()
+    assert run.stdin is not None
+    run.stdin.write("go\n")
+    run.stdin.flush()
+    _await(run)
+    return time.perf_counter() - begin
+
+
+def _await(run: subprocess.Popen[str]) -> None:
+    assert run.stdout is not None
+    if not run.stdout.readline():
+        raise RuntimeError(f"esp train ends before its first turn, or fails: {run.communicate()[1].strip()}")
+
+
+class _Alternating:
+    """A case that is measured whole, once a round with each code."""
+
+    def compare(self, trees: Mapping[str, Path], rounds: int, chosen: Sequence[str]) -> Rates:
+        rates: Rates = {side: [] for side in trees}
+        for _ in range(rounds):
+            for side, tree in trees.items():
+                with tempfile.TemporaryDirectory() as folder:
+                    rates[side].append(self.measure(tree, Path(folder), chosen if side == "new" else ()))
+        return rates
 
     def measure(self, tree: Path, folder: Path, chosen: Sequence[str]) -> float:
-        """Return seed-steps per second with the code of `tree`, with more options behind those of the case."""
-        options = self.options if self.end_to_end else f"{self.options} {NO_EVALUATION}"
-        begin = time.perf_counter()
-        size = ("--seeds", str(self.seeds), "--steps", str(self.steps), "--out", "run", *chosen)
-        python(tree, folder, *ESP, "train", *options.split(), *size)
-        seconds = time.perf_counter() - begin
-        if self.end_to_end:
-            return self.seeds * self.steps / seconds
-        rows = map(json.loads, (folder / "run" / "metrics.jsonl").read_text().splitlines())
-        return self.seeds * steps_per_second(rows)
+        """Return steps per second with the code of `tree`."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)
-class Worlds:
+class WholeTraining(_Alternating):
+    """`esp train` from its start to its end, with start and evaluations."""
+
+    options: str
+    steps: int
+
+    def measure(self, tree: Path, folder: Path, chosen: Sequence[str]) -> float:
+        begin = time.perf_counter()
+        python(tree, folder, *ESP, "train", *self.options.split(), "--steps", str(self.steps), "--out", "run", *chosen)
+        return self.steps / (time.perf_counter() - begin)
+
+
+@dataclass(frozen=True)
+class Worlds(_Alternating):
     """The worlds of a task alone, measured by the tree's own env_speed.py."""
 
     task: str
 
     def measure(self, tree: Path, folder: Path, _: Sequence[str]) -> float:
-        """Return environment steps per second with the code of `tree`."""
         script = str(tree / "tests" / "benchmarks" / "env_speed.py")
         python(tree, folder, script, "--task", self.task, "--worlds", "1024", "--json", "speed.json")
         return float(json.loads((folder / "speed.json").read_text())["records"][0]["steps_per_second"])
 
 
-Case = Training | Worlds
+Case = Training | WholeTraining | Worlds
 
 
 def _cases() -> Iterator[tuple[str, Case]]:
@@ -95,36 +182,19 @@ def _cases() -> Iterator[tuple[str, Case]]:
         "mappo default, esp, bfloat16": (f"{perceptron} {bfloat16}", 800),
     }
     for name, (options, per_iteration) in mappo.items():
-        yield f"{name}, 10 seeds", Training(options, 10, 12 * per_iteration)
-        yield f"{name}, 1 seed", Training(options, 1, 25 * per_iteration)
+        yield f"{name}, 10 seeds", Training(options, 10, per_iteration)
+        yield f"{name}, 1 seed", Training(options, 1, per_iteration)
     for name in ("maddpg", "qmix", "qmix gru"):
         algorithm, _, network = name.partition(" ")
         options = f"--algo {algorithm} --network {network or 'mlp'}"
-        yield f"{name}, plain, 10 seeds", Training(f"{options} --prior none", 10, 12 * 200)
-        yield f"{name}, esp, 10 seeds", Training(options, 10, 12 * 200)
-    yield "formation, esp train end to end, 1 seed", Training("--task formation", 1, 48_000, end_to_end=True)
+        yield f"{name}, plain, 10 seeds", Training(f"{options} --prior none", 10, 200)
+        yield f"{name}, esp, 10 seeds", Training(options, 10, 200)
+    yield "formation, esp train end to end, 1 seed", WholeTraining("--task formation", 48_000)
     for task in ("navigation", "predator-prey", "wildlife"):
         yield f"{task} worlds", Worlds(task)
 
 
 CASES: dict[str, Case] = dict(_cases())
-
-
-def steps_per_second(rows: Iterable[Mapping[str, Any]]) -> float:
-    """Return the median rate of the iterations behind the warm-up, less the last one, which evaluates.
-
-    Args:
-        rows: of metrics.jsonl.
-
-    Raises:
-        ValueError: the run has too few iterations.
-    """
-    marks = [(row["step"], row["time/elapsed_s"]) for row in rows if "time/elapsed_s" in row][WARM_UP - 1 : -1]
-    if len(marks) < 2:
-        raise ValueError(
-            f"the run is too short to measure: it needs more than {WARM_UP + 1} iterations; raise its steps"
-        )
-    return statistics.median((b - a) / (t - s) for (a, s), (b, t) in pairwise(marks))
 
 
 def paths(tree: Path) -> dict[str, str]:
@@ -153,11 +223,6 @@ def checked_out(commit: str) -> Iterator[Path]:
             subprocess.run([*git, "remove", "--force", str(tree)], check=True)
 
 
-def measure(case: Case, tree: Path, chosen: Sequence[str] = ()) -> float:
-    with tempfile.TemporaryDirectory() as folder:
-        return case.measure(tree, Path(folder), chosen)
-
-
 def use(tree: Path) -> None:
     """Check that Python finds the code of `tree`, and leave it compiled.
 
@@ -174,7 +239,7 @@ def use(tree: Path) -> None:
 def main() -> None:
     """Parse the command line, measure, print, and write JSON where asked."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--commit", default="1b792e9", help="what to compare with")
+    parser.add_argument("--commit", default="0f974cc", help="what to compare with")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--cases", nargs="+", default=["*"], metavar="PATTERN", help="names, or patterns as 'qmix*'")
     parser.add_argument("--set", nargs="+", default=[], metavar="NAME=VALUE", help="settings of the working tree alone")
@@ -183,21 +248,16 @@ def main() -> None:
     names = [name for name in CASES if any(fnmatch(name, pattern) for pattern in args.cases)]
     if not names:
         parser.error(f"no case has such a name; the cases are: {'; '.join(CASES)}")
-    rates: dict[str, dict[str, list[float]]] = {name: {"old": [], "new": []} for name in names}
+    rates: dict[str, Rates] = {}
+    ratios: dict[str, float] = {}
     with checked_out(args.commit) as old:
         trees, chosen = {"old": old, "new": ROOT}, [word for pair in args.set for word in ("--set", pair)]
         for tree in trees.values():
             use(tree)
-        for turn in range(args.rounds):
-            for name in names:
-                for side, tree in trees.items():
-                    rates[name][side].append(measure(CASES[name], tree, chosen if side == "new" else ()))
-                last = rates[name]["new"][-1] / rates[name]["old"][-1]
-                print(f"round {turn + 1} of {args.rounds}: {name}: {last:.2f}", file=sys.stderr, flush=True)
-    ratios = {
-        name: statistics.median(new / old for old, new in zip(r["old"], r["new"], strict=True))
-        for name, r in rates.items()
-    }
+        for name in names:
+            rates[name] = found = CASES[name].compare(trees, args.rounds, chosen)
+            ratios[name] = statistics.median(new / old for old, new in zip(found["old"], found["new"], strict=True))
+            print(f"{name}: {ratios[name]:.2f}", file=sys.stderr, flush=True)
     table = Table("case", "old, steps/s", "new, steps/s", "faster by", title=f"the working tree against {args.commit}")
     for name, by_side in rates.items():
         old_rate, new_rate = (f"{statistics.median(values):,.0f}" for values in by_side.values())
