@@ -75,16 +75,17 @@ class Training:
     def compare(self, trees: Mapping[str, Path], rounds: int, chosen: Sequence[str]) -> Rates:
         """Return the rates of all turns, with more options behind those of the case for the new code."""
         done = self.seeds * self.per_iteration
-        with ExitStack() as stack:
-            runs = {
-                side: stack.enter_context(self._started(tree, chosen if side == "new" else ()))
-                for side, tree in trees.items()
-            }
-            rates: Rates = {side: [] for side in runs}
-            for turn in range(WARM_UP + TURNS * rounds):
-                for side in list(runs) if turn % 2 else reversed(runs):  # so that neither side gains by its place
-                    rates[side].append(done / _take_turn(runs[side]))
-        return {side: values[WARM_UP:] for side, values in rates.items()}
+        rates: Rates = {side: [] for side in trees}
+        for _ in range(rounds):  # with new processes, whose memory lies elsewhere
+            with ExitStack() as stack:
+                options = {"old": (), "new": chosen}
+                runs = {side: stack.enter_context(self._started(trees[side], options[side])) for side in trees}
+                for turn in range(-WARM_UP, TURNS):
+                    for side in list(runs) if turn % 2 else reversed(runs):  # so that neither gains by its place
+                        seconds = _take_turn(runs[side])
+                        if turn >= 0:
+                            rates[side].append(done / seconds)
+        return rates
 
     @contextmanager
     def _started(self, tree: Path, chosen: Sequence[str]) -> Iterator[subprocess.Popen[str]]:
