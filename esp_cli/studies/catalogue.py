@@ -80,9 +80,10 @@ def _cells(kind: StudyKind, request: Request) -> tuple[Cell, ...]:
 def refuse_unknown_or_twice(noun: str, names: Sequence[str], known: Collection[str]) -> None:
     """Refuse a name that is not known, or that stands twice."""
     for name in names:
-        if name not in known or names.count(name) > 1:
-            fault = "is named twice" if name in known else f"is no {noun}"
-            raise UserError(f"'{name}' {fault}; name each once: {', '.join(map(repr, dict.fromkeys(known)))}")
+        if name not in known:
+            raise UserError(f"'{name}' is no {noun}; choose from {', '.join(map(repr, dict.fromkeys(known)))}")
+        if names.count(name) > 1:
+            raise UserError(f"'{name}' is named twice; name it once")
 
 
 def refuse_other_tasks(steps: Iterable[tuple[str | None, int]], tasks: Collection[str]) -> None:

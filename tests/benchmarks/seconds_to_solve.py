@@ -1,7 +1,7 @@
 """Measure how long training takes from nothing until it solves a task, evaluations included.
 
     python tests/benchmarks/seconds_to_solve.py [--preset fast] [--runs 5] [--cases PATTERN ...] [--set NAME=VALUE ...]
-                                                [--threads 2] [--commit 1b792e9] [--json solved.json]
+                                                [--threads 2] [--commit 0f974cc] [--json solved.json]
 
 Each run is an `esp train` with seeds of its own, whose schedules are those of 1M steps. Its steps are those of the
 first evaluation whose mean greedy return over all seeds reaches the case's threshold; its seconds begin with the

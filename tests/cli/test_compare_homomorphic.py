@@ -51,8 +51,8 @@ def test_all_methods_are_trained_and_compared_as_any_study(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--methods", "mpn,cnn"], "name each once: 'mpn', 'mpn-esp', 'empn', 'mpn-ensemble'"),
-        (["--methods", "mpn,mpn"], "'mpn' is named twice; name each once: 'mpn', "),
+        (["--methods", "mpn,cnn"], "choose from 'mpn', 'mpn-esp', 'empn', 'mpn-ensemble'"),
+        (["--methods", "mpn,mpn"], "'mpn' is named twice; name it once"),
         (["--grid", "6"], "use odd numbers"),
         (["--group", "so2"], "so2 cannot act on wildlife"),
         (["--set", "network.name=mlp"], "is what this study varies by itself"),

@@ -115,7 +115,7 @@ def test_a_study_of_breakings_is_run_in_pieces_and_runs_once_what_trains_the_sam
     more = esp(*study, "--broken-by", "mud", "--dry-run", "--jobs", 2)
     assert "4 runs to do" in more.stdout, "the unbroken ones are there"
     assert refused("ablate", "modules", "--broken-by", "wind") == "--broken-by is for esp ablate breaking; leave it out"
-    assert "'luck' is no variant of this study; name each once: " in refused(*study, "--methods", "luck")
+    assert "'luck' is no variant of this study; choose from " in refused(*study, "--methods", "luck")
 
 
 def test_unlike_numbers_of_episodes_are_told(finished: Path, copied: Path, tmp_path: Path) -> None:
@@ -135,7 +135,7 @@ def test_unlike_numbers_of_episodes_are_told(finished: Path, copied: Path, tmp_p
     [
         (["ablate", "colours"], "'colours' is not one of"),
         (["ablate", "modules", "--steps", "soon"], "'soon' is not a number of steps"),
-        (["ablate", "transforms", "--methods", "rot90, rot270"], "name each once: 'none', 'rot90', 'rot90, rot180', "),
+        (["ablate", "transforms", "--methods", "rot90, rot270"], "choose from 'none', 'rot90', 'rot90, rot180', "),
         (["ablate", "modules", "--set", "prior.transforms=c8"], "c8 cannot act on navigation"),
         (["reproduce", "table1", "--jobs", "0"], "--jobs"),
         (["ablate", "modules", "--reuse", "none"], "none is no study"),

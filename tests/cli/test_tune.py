@@ -37,7 +37,7 @@ def test_a_dry_run_states_the_cost_of_equal_budgets_and_makes_nothing(command: l
         (["--budget", "1" + "0" * 309], "--budget"),
         (["--task", "formation"], "esp tune takes one --task, not 2; run it once for each"),
         (["--algo", "mappo,qmix"], "esp tune takes one --algo, not 2"),
-        (["--prior", "magic"], "'magic' is no kind of prior; name each once: 'none', 'esp', "),
+        (["--prior", "magic"], "'magic' is no kind of prior; choose from 'none', 'esp', "),
         (["--set", "mappo.learning_rate=1e-3"], "--set mappo.learning_rate fixes what the space varies"),
         (["--algo", "qmix"], "cannot set 'mappo.num_envs'"),
         (["--algo", "mapo"], "unknown algorithm 'mapo'; did you mean 'mappo'?"),

@@ -192,8 +192,8 @@ def test_a_setting_is_without_effect_where_every_run_that_it_concerns_leaves_it_
         ("ablate-breaking", {"overrides": {"navigation.wind": 0.3}}, "navigation.wind is what this study varies"),
         ("table1", {"overrides": {"qmix.gamma": 0.9}}, "--set qmix.gamma concerns no run of this study"),
         ("table1", {"overrides": {"formation.physics": "pymunk"}}, "concerns no run"),
-        ("table1", {"tasks": ("navigation",) * 2}, "'navigation' is named twice; name each once"),
-        ("table1", {"algorithms": ("mappo",) * 2}, "'mappo' is named twice; name each once"),
+        ("table1", {"tasks": ("navigation",) * 2}, "'navigation' is named twice; name it once"),
+        ("table1", {"algorithms": ("mappo",) * 2}, "'mappo' is named twice; name it once"),
         ("table1", {"steps": (("formation", 100),)}, "--steps formation=100 concerns no run"),
         (
             "table1",

@@ -123,7 +123,7 @@ def test_what_is_judged_gets_no_further_trials_but_other_methods_do(tmp_path: Pa
 @pytest.mark.parametrize(
     ("choice", "sentence"),
     [
-        ({"variants": ("plain", "magic")}, "'magic' is no method; name each once: 'plain', 'ESP', "),
+        ({"variants": ("plain", "magic")}, "'magic' is no method; choose from 'plain', 'ESP', "),
         ({"variants": ("plain", "plain")}, "'plain' is named twice"),
         ({"algorithms": ("mappo", "qmix")}, "this benchmark tunes one learner, whose space it has"),
         ({"algorithms": ("reinforce",)}, "this benchmark tunes one learner, whose space it has"),
