@@ -59,10 +59,7 @@ def passed(make: Callable[..., Any], inputs: Sequence[Tensor], parameters: Seque
 def perceptron_with_vjp(
     shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor]
 ) -> tuple[Tensor, Callable[[Tensor], list[Tensor]]]:
-    """Return what `perceptron` does, without a graph, and its VJP, to be called where no graph is made either.
-
-    Nothing may change in place before that is used.
-    """
+    """Return what `perceptron` does, without a graph, and its VJP; nothing may change in place before that is used."""
     with torch.no_grad():
         run = _pass(shape, inputs, parameters, keep=True)
     return run.outputs.unflatten(1, inputs[0].shape[1:-1]), lambda slope: run.backward(slope.flatten(1, -2))
@@ -150,7 +147,8 @@ class _Pass:
         self.outputs = _joined([run[-1] for run in self._runs])
 
     def backward(self, grad: Tensor) -> list[Tensor]:
-        grads, _ = self.backward_to(grad, [True] * (2 * len(self._weights)), [])
+        with torch.no_grad():
+            grads, _ = self.backward_to(grad, [True] * (2 * len(self._weights)), [])
         return [g for g in grads if g is not None]
 
     def backward_to(

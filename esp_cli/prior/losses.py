@@ -95,7 +95,8 @@ class Loss:
                 elif root.graph.requires_grad:
                     graphs.append((root.graph, slope))
         if graphs:
-            total = sum(_WithSlope.apply(*pair) for pair in graphs)  # type: ignore[no-untyped-call]
+            roots = [_WithSlope.apply(*pair) for pair in graphs]  # type: ignore[no-untyped-call]
+            total = sum(roots[1:], start=roots[0])
             by = torch.autograd.grad(total, parameters, allow_unused=True, materialize_grads=True)
             found.append((parameters, [*by]))
         return found
