@@ -89,10 +89,12 @@ class Training:
 
     @contextmanager
     def _started(self, tree: Path, chosen: Sequence[str]) -> Iterator[subprocess.Popen[str]]:
-        words = ("train", *self.options.split(), *NO_EVALUATION.split(), "--seeds", str(self.seeds), *chosen)
+        steps = self.per_iteration * (WARM_UP + TURNS + 1)  # so few that network.compiled=auto is off
+        size = ("--seeds", str(self.seeds), "--steps", str(steps), "--out", "run")
+        words = ("train", *self.options.split(), *NO_EVALUATION.split(), *size, *chosen)
         with tempfile.TemporaryDirectory() as folder:
             run = subprocess.Popen(
-                [sys.executable, "-c", IN_TURNS, *words, "--steps", "1M", "--out", "run"],
+                [sys.executable, "-c", IN_TURNS, *words],
                 cwd=folder,
                 env=paths(tree),
                 stdin=subprocess.PIPE,
