@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -139,7 +140,10 @@ def check_robot(
 def _print_audit(name: str, copies: Sequence[Copy]) -> None:
     wrong = [(copy.element, *row) for copy in copies for row in copy.wrong]
     if not wrong:
-        console.say(f"{name} is right: its copies are {', '.join(copy.element for copy in copies)}")
+        elements = [copy.element for copy in copies]
+        console.say(f"{name} is right: its copies are {', '.join(elements)}")
+        if again := [f"{element} {count} times" for element, count in Counter(elements).items() if count > 1]:
+            console.say(f"but it returns {', '.join(again)}; once is enough")
         return
     console.say(f"{name} is wrong in {len(wrong)} numbers")
     for k, copy in enumerate(copies):

@@ -60,7 +60,12 @@ class Policy(nn.Module):
     def step(self, obs: Tensor, memory: Tensor, action_mask: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return outputs, normalised, for obs [S, E, N, D] and allowed actions [S, E, N, A], and the memory."""
         outputs, memory = self.actor.step(obs.flatten(1, 2), memory)
-        return self._normalised(outputs.unflatten(1, obs.shape[1:3]), action_mask), memory
+        return self._chosen_from(outputs, obs, action_mask), memory
+
+    def _chosen_from(self, outputs: Tensor, obs: Tensor, action_mask: Tensor | None) -> Tensor:
+        """Return the normalised outputs [S, E, N, outputs] of a step; a seed that is lost to NaN does what is allowed."""
+        outputs = outputs.unflatten(1, obs.shape[1:3])
+        return self._normalised(outputs if action_mask is None else outputs.nan_to_num(), action_mask)
 
     def _normalised(self, outputs: Tensor, action_mask: Tensor | None) -> Tensor:
         return self.head.normalise(masked(outputs, action_mask))
@@ -118,8 +123,7 @@ class HistoryPolicy(Policy):
             return super().step(obs, memory, action_mask)
         hidden, previous = memory.split((self.actor.memory_width, self.head.num_outputs), -1)
         outputs, hidden = self.actor.step(torch.cat([obs.flatten(1, 2), previous], -1), hidden)
-        outputs = self._normalised(outputs.unflatten(1, obs.shape[1:3]), action_mask)
-        return outputs, torch.cat([hidden, previous], -1)
+        return self._chosen_from(outputs, obs, action_mask), torch.cat([hidden, previous], -1)
 
     def remember(self, memory: Tensor, action: Tensor) -> Tensor:
         """Put the action [S, E, N(, width)] that was really taken into the memory."""

@@ -75,6 +75,21 @@ def test_a_masked_action_is_never_drawn(cls):
         assert bool(mask.gather(-1, head.mode(outputs).unsqueeze(-1)).all())
 
 
+@pytest.mark.parametrize("algorithm", ["mappo", "maddpg", "qmix"])
+def test_a_seed_that_is_lost_to_nan_does_what_is_allowed_until_it_is_stopped(algorithm):
+    policy = learner(algorithm).policy
+    with torch.no_grad():
+        for parameter in policy.actor.parameters():
+            parameter.fill_(math.nan)
+    obs = torch.zeros(policy.num_seeds, 1000, policy.num_agents, next(policy.actor.parameters()).shape[1])
+    mask = torch.zeros(*obs.shape[:-1], policy.head.num_outputs, dtype=torch.bool)
+    mask[..., 1:] = True
+    noise = policy.noise(1000, policy.num_agents, [torch.Generator() for _ in range(policy.num_seeds)])
+    for chosen in (None, noise):
+        action, _ = policy.act(obs, policy.initial_memory(1000, obs), chosen, mask)
+        assert bool(action.gt(0).all())
+
+
 def test_epsilon_is_shared_among_the_allowed_actions():
     """At epsilon 1 the two allowed ones have 1/2 each, whatever the actor says."""
     head = head_of(ExploringCategorical)

@@ -224,6 +224,16 @@ def test_the_command_writes_audits_and_refuses(tmp_path, monkeypatch):
     assert esp("check", "mirror", "my_mirror:compute_symmetric_states", "biped.xml").stdout == (
         "my_mirror:compute_symmetric_states is right: its copies are identity, flip-x\n"
     )
+    Path("my_again.py").write_text(
+        "import torch\nfrom my_mirror import compute_symmetric_states\n"
+        "def again(env, obs, actions):\n"
+        "    made = compute_symmetric_states(env, obs, actions)\n"
+        "    return tuple(torch.cat([x, x[len(actions) :]]) for x in made)\n"
+    )
+    assert esp("check", "mirror", "my_again:again", "biped.xml").stdout == (
+        "my_again:again is right: its copies are identity, flip-x, flip-x\n"
+        "but it returns flip-x 2 times; once is enough\n"
+    )
     proof = [sys.executable, "-I", "test_my_mirror.py"]
     assert subprocess.run(proof, capture_output=True, text=True, check=True).stdout == "proven\n"
     right = Path("my_mirror.py").read_text()
