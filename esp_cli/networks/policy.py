@@ -63,7 +63,7 @@ class Policy(nn.Module):
         return self._chosen_from(outputs, obs, action_mask), memory
 
     def _chosen_from(self, outputs: Tensor, obs: Tensor, action_mask: Tensor | None) -> Tensor:
-        """Return the normalised outputs [S, E, N, outputs] of a step; a seed that is lost to NaN does what is allowed."""
+        """Return the normalised outputs [S, E, N, outputs] of a step; a seed lost to NaN does what is allowed."""
         outputs = outputs.unflatten(1, obs.shape[1:3])
         return self._normalised(outputs if action_mask is None else outputs.nan_to_num(), action_mask)
 
