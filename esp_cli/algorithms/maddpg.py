@@ -41,7 +41,7 @@ class MaddpgConfig(ExploringConfig):
     actor_actions: Literal["own", "all"] = Field(
         "all",
         description="the actor's gradient: all agents' actions are the policy's, and it follows the "
-        "mean of the agents' Q; paper: each agent's own alone is",
+        "mean of the agents' Q (with actor_gradient=expected, each its own Q); paper: each agent's own alone is",
     )
     actor_gradient: Literal["sampled", "expected"] = Field(
         "sampled",

@@ -69,7 +69,12 @@ class MappoConfig(LearnerConfig):
     )
     critic_activation: Literal["relu", "tanh"] = Field("relu", description="the actor's is network.activation")
     truncation: int = Field(10, ge=0, description="recurrent networks: steps through which gradients flow")
-    chunk_steps: int = Field(8000, ge=1, description="environment steps, over all seeds, of a forward pass; speed only")
+    chunk_steps: int = Field(
+        8000,
+        ge=1,
+        description="environment steps, over all seeds, of a forward pass; speed only, and a whole minibatch where "
+        "agents end one by one",
+    )
 
     def without_effect(self, network: NetworkConfig, spec: Callable[[], TaskSpec]) -> frozenset[str]:
         idle = set() if network.recurrent else {"truncation"}

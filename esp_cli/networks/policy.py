@@ -76,7 +76,11 @@ class Policy(nn.Module):
         """Return what `Environment.step` takes and the next memory; greedy where `noise` is None."""
         outputs, memory = self.step(obs, memory, action_mask)
         action = self.head.mode(outputs) if noise is None else self.head.sample(outputs, noise)
-        return self.head.to_environment(action), memory
+        return self.head.to_environment(action), self.remember(memory, action)
+
+    def remember(self, memory: Tensor, action: Tensor) -> Tensor:
+        """Put the action [S, E, N(, width)], as `Head.sample` returns it, into the memory of a policy that sees it."""
+        return memory
 
 
 class StochasticPolicy(Policy):
@@ -126,16 +130,9 @@ class HistoryPolicy(Policy):
         return self._chosen_from(outputs, obs, action_mask), torch.cat([hidden, previous], -1)
 
     def remember(self, memory: Tensor, action: Tensor) -> Tensor:
-        """Put the action [S, E, N(, width)] that was really taken into the memory."""
         if not self.recurrent:
             return memory
         return torch.cat([memory[..., : self.actor.memory_width], self.head.encode(action).flatten(1, 2)], -1)
-
-    def act(
-        self, obs: Tensor, memory: Tensor, noise: Tensor | None = None, action_mask: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        action, memory = super().act(obs, memory, noise, action_mask)
-        return action, self.remember(memory, action)
 
     def unroll(self, obs: Tensor, action: Tensor, action_mask: Tensor | None = None) -> Tensor:
         """Return the normalised outputs over whole episodes, from empty memory, one row for each row of `obs`.

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from fractions import Fraction
 
 import torch
 from torch import Tensor
 
 from esp_cli.networks.contract import IoSpec, Memoryless, Network
 from esp_cli.symmetry.maps import map_of
+from esp_cli.symmetry.plane import PlaneElement
 from esp_cli.symmetry.representation import layout_operator
 from esp_envs.errors import UserError
 from esp_envs.spec import ActionSpace, Discrete, Kind, Layout
@@ -71,7 +73,9 @@ class LocalFrame(Memoryless, Symmetrised):
             raise UserError(
                 f"network.symmetrise={LOCAL}{group} is for networks without memory and messages; use {group}"
             )
-        angle = math.pi / self.group.order
+        sector = Fraction(1, self.group.order)
+        on_axis = PlaneElement(sector, mirrored=True) in map(PlaneElement.of, self.group.elements)
+        angle = math.pi * sector * (2 if on_axis else 1)  # a mirror leaves a direction on its axis alone
         along = _on_vectors(io.layout, (math.cos(angle), math.sin(angle)))
         if not any(along):
             raise UserError(f"network.symmetrise={LOCAL}{group} needs vectors, and {io.spaces.label} shows none")

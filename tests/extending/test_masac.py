@@ -69,6 +69,25 @@ def test_it_trains_and_is_evaluated_drawn_exported_and_loaded(tmp_path, kind, pr
 
 
 @both
+@torch.no_grad()
+def test_a_recurrent_policy_plays_with_the_history_that_it_learns_from(actions):
+    learned = soft(actions, network__name="gru")
+    policy, env = learned.policy, learned.collector.env
+    obs = env.reset().obs
+    played = policy.initial_memory(env.num_envs, obs)
+    learning = played.clone()
+    for _ in range(3):
+        action, played = policy.act(obs, played)
+        outputs, learning = policy.step(obs, learning)
+        latent = policy.head.mode(outputs)
+        learning = policy.remember(learning, latent)
+        assert torch.equal(action, policy.head.to_environment(latent))
+        assert torch.equal(played, learning)
+        assert bool(played[..., -policy.head.num_outputs :].any())
+        obs = env.step(action).next.obs
+
+
+@both
 @pytest.mark.parametrize("choice", [{}, {"prior__replay": "stored", "network__name": "gru"}])
 def test_a_learner_restored_between_iterations_goes_on_bit_for_bit(actions, choice):
     straight, halted = soft(actions, **choice), soft(actions, **choice)

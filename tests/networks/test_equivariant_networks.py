@@ -150,6 +150,13 @@ def test_the_equivariant_network_for_vectors_is_exact_and_a_perceptron_is_not(ta
     assert errors(spec, local, obs, state, group, reads) < EXACT
 
 
+@pytest.mark.parametrize("group", ["flip-x", "flip-y", "flip-diagonal", "c3", "rot120,flip-x", "rot120,flip-y", "d2"])
+def test_a_local_frame_is_exact_wherever_the_mirrors_of_its_group_lie(group) -> None:
+    spec, obs, state = scene("navigation", actions="continuous")
+    local = NETWORKS["mlp"](hidden=(16, 16), symmetrise=f"local-{group}")
+    assert errors(spec, local, obs, state, group) < EXACT
+
+
 class Echo(Memoryless):
     def forward(self, x: Tensor) -> Tensor:
         return x
