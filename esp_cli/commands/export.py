@@ -52,16 +52,21 @@ def export(
         raise UserError(f"there is no format '{unknown}'; the formats are {', '.join(FORMATS)}")
     if seed is not None and episodes is not None:
         raise UserError("--episodes finds the best seed, and --seed names one; leave one of them out")
-    from esp_cli.export.export import export as write
+    from esp_cli.export.export import made, put, refuse_taken
     from esp_cli.policies.loading import open_policy
 
     options.register_named(task, [algo], network)
     trained = open_policy(policy, algo, prior)
     for text in trained.notes:
         console.note(text)
-    chosen = _best(trained, episodes or EPISODES) if seed is None else seed
     parts = {role.name: trained.of_role(role.name) for role in trained.spec.roles} or {"": trained}
-    written = {role: write(part.single_seed(chosen), formats, out / role, force) for role, part in parts.items()}
+    for role in parts:
+        refuse_taken(out / role, formats, force)
+    chosen = _best(trained, episodes or EPISODES) if seed is None else seed
+    ready = {role: made(part.single_seed(chosen), formats) for role, part in parts.items()}
+    for role, (_, files) in ready.items():  # all of them, or none
+        put(files, out / role)
+    written = {role: exported for role, (exported, _) in ready.items()}
 
     def show() -> None:
         for role, one in written.items():

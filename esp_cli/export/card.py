@@ -9,12 +9,14 @@ import numpy as np
 from esp_cli.defaults import __version__
 from esp_cli.export.check import Sample
 from esp_cli.export.program import Program
+from esp_cli.export.sets import named
+from esp_cli.files.documents import DocumentFormat
 from esp_cli.networks.heads import BoundedGaussian
 from esp_cli.policies.loading import TrainedPolicy
 from esp_envs.registry import task_class
 from esp_envs.spec import Discrete, Layout, TaskSpec, describe_action
 
-EXPORT_FORMAT, EXPORT_VERSION = "esp-export", 1
+EXPORT = DocumentFormat("esp-export", 1, "the description of an export")
 
 
 def describe(trained: TrainedPolicy, program: Program, sample: Sample) -> dict[str, Any]:
@@ -27,9 +29,7 @@ def describe(trained: TrainedPolicy, program: Program, sample: Sample) -> dict[s
     rows = {"observation": sample.obs, "memory": sample.memory, "action_mask": sample.mask, "outputs": sample.outputs}
     rows |= {"action": sample.action, "memory_after": sample.after}
     task = ("name", "version", "convention", "num_agents", "control_period_s", "settings")
-    return {
-        "format": EXPORT_FORMAT,
-        "version": EXPORT_VERSION,
+    content: dict[str, Any] = {
         "esp_version": __version__,
         "task": {name: getattr(spec, name) for name in task},
         "policy": {
@@ -48,6 +48,7 @@ def describe(trained: TrainedPolicy, program: Program, sample: Sample) -> dict[s
         "example": {name: array[first].tolist() for name, array in rows.items() if array is not None}
         | ({"sets": {name: table[0].tolist() for name, table in sample.sets.items()}} if sample.sets else {}),
     }
+    return EXPORT.document(content)
 
 
 def _fields(layout: Layout) -> list[dict[str, Any]]:
@@ -80,6 +81,7 @@ def words(trained: TrainedPolicy, program: Program, description: dict[str, Any])
         "spec": spec,
         "program": program,
         "description": description,
+        "set_names": named(name for name, _ in program.sets),
         "options": [f"{name}: {means}" for name, means in describe_action(spec.action)],
         "most_rows": 16,  # beyond which only `policy.json` lists them
         "of_robot": any(hasattr(field.kind, "parts") for field in spec.observation.fields),  # may be seen from its body

@@ -113,6 +113,6 @@ def compare(sample: Sample, runner: Runner) -> Agreement:
     if not gap <= TOLERANCE * largest or not ties:
         raise RuntimeError(
             f"the export differs from the policy by {gap:g} of {largest:g}; this is a bug, unless the policy's outputs "
-            "jump with the rounding of its observations"
+            "jump with the rounding of its observations, as where network.near chooses among things equally near"
         )
     return Agreement(len(sample.obs), gap, int(differing.sum()) if chooses else None)

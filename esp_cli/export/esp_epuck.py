@@ -53,7 +53,10 @@ class Pilot:
             ValueError: other shapes, or fewer robots or pillars than the policy sees.
         """
         poses, goals = np.asarray(poses, float), np.asarray(goals, float)
-        pillars = np.asarray(pillars, float).reshape(-1, 2)
+        pillars = np.asarray(pillars, float)
+        if pillars.size and (pillars.ndim != 2 or pillars.shape[1] != 2):
+            raise ValueError(f"pillars {pillars.shape} should be [M, 2]")
+        pillars = pillars.reshape(-1, 2)
         if poses.ndim != 2 or poses.shape[1] != 3 or goals.shape != (len(poses), 2):
             raise ValueError(f"poses {poses.shape} and goals {goals.shape} should be [N, 3] and [N, 2]")
         position, heading = poses[:, :2], poses[:, 2]

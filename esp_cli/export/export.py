@@ -13,19 +13,19 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from esp_cli.export import c_file, epuck
-from esp_cli.export.card import describe, shortly, words
+from esp_cli.export.card import EXPORT, describe, shortly, words
 from esp_cli.export.check import Agreement, Runner, Sample, compare, take_sample
 from esp_cli.export.numpy_file import numpy_runner, numpy_source
 from esp_cli.export.onnx_file import onnx_model, onnx_runner
 from esp_cli.export.program import Program, program_of
 from esp_cli.export.templates import RUNTIME, filled
 from esp_cli.export.torch_file import torch_archive, torch_runner
+from esp_cli.files.documents import DocumentError
 from esp_cli.files.writing import replace_file
 from esp_cli.policies.loading import TrainedPolicy
 from esp_envs.errors import UserError
 
 DESCRIPTION = "policy.json"
-_PROGRAMS = ("policy.onnx", "policy.pt2", "policy.h", "policy.c", "policy_example.c", "policy.py", "esp_epuck.py")
 Files = dict[str, bytes]
 
 
@@ -45,6 +45,7 @@ class Job:
 class Format:
     """How a policy is written for another program."""
 
+    files: tuple[str, ...]  # that may be written
     write: Callable[[Job], Files]
     run: Callable[[Path, Program], Runner]  # makes what acts by the files in a folder
 
@@ -87,21 +88,35 @@ def _summary(job: Job) -> str:
 
 FORMATS = {
     "onnx": Format(
+        ("policy.onnx",),
         lambda job: {"policy.onnx": onnx_model(job.program, json.dumps(job.description))},
         lambda folder, _: onnx_runner(folder / "policy.onnx"),
     ),
     "torch": Format(
+        ("policy.pt2",),
         lambda job: {"policy.pt2": torch_archive(job.program, json.dumps(job.description))},
         lambda folder, _: torch_runner(folder / "policy.pt2"),
     ),
-    "c": Format(_c, lambda folder, program: c_file.c_runner(folder / "policy.c", program)),
-    "numpy": Format(_numpy, lambda folder, _: numpy_runner(folder / "policy.py")),
+    "c": Format(
+        ("policy.h", "policy.c", "policy_example.c"),
+        _c,
+        lambda folder, program: c_file.c_runner(folder / "policy.c", program),
+    ),
+    "numpy": Format(("policy.py", "esp_epuck.py"), _numpy, lambda folder, _: numpy_runner(folder / "policy.py")),
 }
 """The formats by name; `esp export` lists them without importing them."""
 
 
 def export(trained: TrainedPolicy, formats: Sequence[str], folder: Path, force: bool = False) -> Exported:
     """Write one seed's policy in some formats, with `policy.json` and a README, after checking each."""
+    refuse_taken(folder, formats, force)
+    exported, files = made(trained, formats)
+    put(files, folder)
+    return exported
+
+
+def made(trained: TrainedPolicy, formats: Sequence[str]) -> tuple[Exported, Files]:
+    """Make the files of an export and check each format; nothing is written yet."""
     formats = tuple(dict.fromkeys(formats))
     program = program_of(trained.policy, trained.spec.masks)
     sample = take_sample(trained, program)
@@ -114,23 +129,35 @@ def export(trained: TrainedPolicy, formats: Sequence[str], folder: Path, force: 
     written = {name: content for own in files.values() for name, content in own.items()}
     written[DESCRIPTION] = (json.dumps(job.description | {"formats": formats}, indent=2) + "\n").encode()
     written["README.md"] = _readme(job, results)
-    _write(written, folder, force)
-    return Exported(results, job.program.num_parameters)
+    return Exported(results, job.program.num_parameters), written
 
 
-def _write(files: Files, folder: Path, force: bool) -> None:
-    """Put files into a folder, each as a whole."""
+def refuse_taken(folder: Path, formats: Sequence[str], force: bool) -> None:
+    """Refuse a file in the folder's place and, unless forced, files in the place of those of an export."""
     if folder.exists() and not folder.is_dir():
         raise UserError(f"{folder} is a file; name a folder for the export with --out")
-    folder.mkdir(parents=True, exist_ok=True)
-    taken = sorted(name for name in files if (folder / name).exists())
+    names = ["README.md", DESCRIPTION, *(file for name in formats for file in FORMATS[name].files)]
+    taken = [name for name in dict.fromkeys(names) if (folder / name).exists()]
     if taken and not force:
-        raise UserError(f"{folder} has {taken[0]} already; choose another --out, or replace it with --force")
-    for name in _PROGRAMS if taken else ():  # of another policy, in a format that is not written now
-        if name not in files:
-            (folder / name).unlink(missing_ok=True)
+        raise UserError(f"{folder} has {', '.join(taken)} already; choose another --out, or replace it with --force")
+
+
+def put(files: Files, folder: Path) -> None:
+    """Put files into a folder, each as a whole, in the place of all files of an export that is there."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in _exported(folder) - files.keys():
+        (folder / name).unlink(missing_ok=True)
     for name, content in files.items():
         replace_file(folder / name, content)
+
+
+def _exported(folder: Path) -> set[str]:
+    """Return the files that an export wrote into a folder, by its own description; none where there is none."""
+    try:
+        told = EXPORT.read(folder / DESCRIPTION).get("formats")
+    except DocumentError:
+        return set()
+    return {file for name, known in FORMATS.items() if isinstance(told, list) and name in told for file in known.files}
 
 
 def _checked(name: str, files: Files, job: Job) -> Export:

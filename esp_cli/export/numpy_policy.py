@@ -152,7 +152,8 @@ def _pool_sets(x: Any, layer: dict[str, Any], arrays: list[Any], tables: Any) ->
         table = tables[name]
         if at is not None and 0 < layer["near"] < table.shape[-2]:
             here = 0 if reader is None else x[..., None, reader : reader + 2]
-            order = np.square(table[..., at : at + 2] - here).sum(-1).argsort(-1)[..., : layer["near"], None]
+            order = np.square(table[..., at : at + 2] - here).sum(-1).argsort(-1, kind="stable")
+            order = order[..., : layer["near"], None]
             table = np.take_along_axis(table, order, -2)
         things.append(table)
         if at is not None:

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from esp_cli.export.check import Numbers, Runner, Sample
 from esp_cli.export.program import Program
 from esp_cli.networks.heads import masked, squash
+from esp_envs.errors import UserError
 
 
 class TorchProgram(nn.Module):
@@ -68,6 +69,10 @@ def exported_program(program: Program) -> torch.export.ExportedProgram:
     shapes: dict[str, Any] = {name: {0: rows} for name in inputs | named}
     if program.sets:
         widths = {name: len(columns[0]) for name, columns in program.sets}
+        if bad := next((name for name in widths if {*name} & {*"\"'\\\n"}), None):  # it gets into generated code
+            raise UserError(
+                f"things named {bad!r} cannot be exported to torch and ONNX; leave quotes and backslashes out of it"
+            )
         named["sets"] = {name: torch.zeros(2, 3 + k, width) for k, (name, width) in enumerate(widths.items())}
         shapes["sets"] = {name: {0: rows, 1: torch.export.Dim(f"things{k}")} for k, name in enumerate(widths)}
     return torch.export.export(TorchProgram(program).eval(), (*inputs.values(),), named, dynamic_shapes=shapes)

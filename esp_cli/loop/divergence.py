@@ -144,9 +144,10 @@ def _samples_apart(transform: Transform, there: Policy, here: Policy, samples: i
     low, high = (torch.full_like(here.base_dist.mean, end) for end in (-_FAR, _FAR))
     for step in here.transforms:
         low, high = step(low), step(high)
-    margin = _MARGIN * (high - low)
+    margin = max(_MARGIN, 2 * torch.finfo(high.dtype).eps) * (high - low)
+    low, high = low + margin, high - margin
     gaps = []
-    for action in (there.rsample() for _ in range(samples)):
-        home = transform.pull_back(action).clamp(low + margin, high - margin)
+    for action in (there.rsample().clamp(low, high) for _ in range(samples)):
+        home = transform.pull_back(action).clamp(low, high)
         gaps.append(transform.values(log_prob(there, action)) - log_prob(here, home))
     return torch.stack(gaps).mean(0)

@@ -119,7 +119,9 @@ def carry_along(spaces: Spaces, transform: Transform, x: Tensor, lead: torch.Siz
     """Move what goes with its agent: a number as by `carry`, or an action mask."""
     _check_tensor(name, x)
     space = spaces.action
-    if isinstance(space, Discrete) and x.dtype == torch.bool and x.shape == (*lead, *_agents(spaces), space.count):
+    if isinstance(space, Discrete) and x.shape == (*lead, *_agents(spaces), space.count) and space.count > 1:
+        if x.dtype != torch.bool:
+            raise UserError(f"{name} is {x.dtype}, but an action mask is torch.bool; give mask.bool()")
         return transform.push_outputs(x)
     return carry(spaces, transform.per_agent, x, lead, name)
 

@@ -148,12 +148,14 @@ class SetEncoder(nn.Module):
         self.rows, features = rows, config.width
         self.own = Embedding(generators, (rows.num_own, features), config) if rows.num_own > features else None
         self.num_own = features if self.own else rows.num_own
-        self.embed = nn.ModuleDict(
-            {
-                family.name: Embedding(generators, (width + self.num_own, features, features), config)
-                for family, width in zip(rows.families, rows.widths, strict=True)
-            }
-        )
+        self.embed = nn.ModuleDict()
+        for family, width in zip(rows.families, rows.widths, strict=True):
+            try:
+                self.embed[family.name] = Embedding(generators, (width + self.num_own, features, features), config)
+            except KeyError:  # it cannot be part of a weight's name
+                raise UserError(
+                    f"a network over sets cannot have things named '{family.name}'; give this field another name"
+                ) from None
         self.width = self.num_own + 2 * features * len(rows.families)
 
     def forward(self, x: Tensor, each: Sequence[str] = ()) -> tuple[list[Tensor], list[Tensor]]:

@@ -75,14 +75,22 @@ def test_what_is_there_is_kept_unless_forced(finished: Path, tmp_path: Path) -> 
     arguments = ("export", finished, "-f", "numpy", "-o", tmp_path, "--seed", 3)
     esp(*arguments)
     before = (tmp_path / "policy.py").read_bytes()
-    assert "has README.md already" in refused(*arguments)
+    assert "has README.md, policy.json, policy.py already" in refused(*arguments)
     shutil.copy(tmp_path / "policy.py", tmp_path / "mine.py")
     (tmp_path / "policy.onnx").write_text("of another policy")
+    (tmp_path / "policy.c").write_text("of the user")
+    described = (tmp_path / "policy.json").read_text()
+    (tmp_path / "policy.json").write_text(described.replace('"numpy"', '"numpy", "onnx"'))
     (tmp_path / "policy.py").write_text("")
     esp(*arguments, "--force")
     assert (tmp_path / "policy.py").read_bytes() == before
     assert (tmp_path / "mine.py").exists()
     assert not (tmp_path / "policy.onnx").exists()
+    assert (tmp_path / "policy.c").read_text() == "of the user"
+    (tmp_path / "policy.json").write_text("{")
+    (tmp_path / "policy.onnx").write_text("of the user")
+    esp(*arguments, "--force")
+    assert (tmp_path / "policy.onnx").exists()
 
 
 def test_episodes_that_choose_nothing_are_refused(finished: Path, tmp_path: Path) -> None:

@@ -243,6 +243,12 @@ def test_a_run_is_trained_and_evaluated_and_each_roles_policy_acts_and_is_export
         described = json.loads((out / name / "policy.json").read_text())
         assert len(described["action"]["options"]) == count
         assert described["task"]["name"] == name
+    (out / "hunter" / "README.md").unlink()
+    (out / "hunter" / "policy.json").unlink()
+    (out / "hunter" / "policy.py").unlink()
+    told = CALL.invoke(app, ["export", str(tmp_path / "run"), "--seed", "1", "-f", "numpy", "-o", str(out)])
+    assert told.exit_code == 2, "the place of the prey is taken"
+    assert not any((out / "hunter").iterdir()), "so nothing is written of the hunter either"
 
 
 def test_what_a_command_says_of_each_role(tmp_path: Path):

@@ -99,6 +99,13 @@ def test_a_team_stands_still_where_it_is_not_safe_to_drive(case: str) -> None:
     assert not pilot.wheels(**safe | UNSAFE[case]).any()
 
 
+@pytest.mark.parametrize("pillars", [[[0.2, 0.2, 0.0]], [[0.2, 0.2, 0.0]] * 2, [0.2, 0.2]])
+def test_pillars_of_another_shape_are_refused(pillars: list) -> None:
+    pilot = Pilot(described(drawn_policy("wheels")), lambda obs: obs[..., :2])
+    with pytest.raises(ValueError, match=r"pillars \(.*\) should be \[M, 2\]"):
+        pilot.wheels(TEAM, GOALS, pillars)
+
+
 def test_a_team_stands_still_where_its_policy_says_no_number() -> None:
     pilot = Pilot(described(drawn_policy("wheels")), lambda obs: np.full((3, 2), np.nan))
     assert not pilot.wheels(TEAM, GOALS, PILLARS).any()

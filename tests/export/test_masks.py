@@ -29,6 +29,7 @@ MASKED = {
     "masked choice": ("tests.fenced:Fenced", "mappo", {}),
     "masked choice, recurrent": ("tests.fenced:Fenced", "maddpg", {"network.name": "gru"}),
     "masked values, recurrent": ("tests.fenced:Fenced", "qmix", {"network.name": "gru"}),
+    "masked choice over sets": ("tests.fenced:Fenced", "mappo", {"network.name": "set"}),
 }
 
 
@@ -59,20 +60,25 @@ def _run_calls(page: str, example: dict) -> None:
     """Run the calls of a README on its worked example, in the folder of the export."""
     rows = {name: np.asarray([example[name]], np.float32) for name in ("observation", "memory")}
     rows["action_mask"] = np.asarray([example["action_mask"]])
+    sets = {name: np.asarray([table], np.float32) for name, table in example.get("sets", {}).items()}
     policy = SimpleNamespace(**runpy.run_path("policy.py"))
     scope = {"policy": policy, "num_agents": 1, "obs": rows["observation"], "action_mask": rows["action_mask"]}
+    scope["sets"] = sets
     for call in re.findall(r"`([^`]* = policy\.[^`]*)`", page):
         exec(call, scope)  # noqa: S102 - the export's own lines
     assert scope["action"].tolist() == [example["action"]]
     (call,) = re.findall(r"`(torch\.export[^`]*)`", page)
     given = {"torch": torch} | {name: torch.from_numpy(array) for name, array in rows.items()}
+    given["sets"] = {name: torch.from_numpy(table) for name, table in sets.items()}
     action = eval(call, given)[0]  # noqa: S307 - likewise
     assert action.tolist() == [example["action"]]
     (told,) = re.findall(r"Inputs: (.*); outputs", page)
+    rows |= {f"set_{name}": table for name, table in sets.items()}
     read = {name: rows[name] for name in re.findall(r"`(\w+)`", told)}
     session = onnx_file.library("onnxruntime").InferenceSession("policy.onnx", providers=["CPUExecutionProvider"])
     assert session.run(["action"], read)[0].tolist() == [example["action"]]
-    assert "esp_policy_act(observation, allowed, " in page
+    tables = "".join(f", set_{name}, num_{name}" for name in sets)
+    assert f"esp_policy_act(observation{tables}, allowed, " in page
     assert f"| action_mask | {', '.join(str(int(allowed)) for allowed in example['action_mask'])} |" in page
 
 

@@ -66,6 +66,18 @@ def test_a_set_of_things_without_a_place_compiles(tmp_path: Path) -> None:
     assert c_runner(tmp_path / "policy.c", program)(sample)[1].tolist() == [[7, 3, 4]]
 
 
+def test_a_name_with_quotes_is_written_or_refused(tmp_path: Path) -> None:
+    one, zero, name = np.ones((1, 1), np.float32), np.zeros(1, np.float32), 'a"b\\n """'
+    marks = SetOf(name, ((1,), (2,)), place=None, reader=None, arrays=(one, 0 * one, zero, one, zero))
+    layer = pool_sets([marks], (), [0], inputs=1, beside=0, near=0, kind="relu")
+    program = Program(1, (layer,), 3, 0, 0, "choose", (), own=(0,), sets=((name, marks.columns),))
+    (tmp_path / "policy.py").write_bytes(numpy_source(program, "", {}))
+    sample = sample_of(*program.split(np.array([[7, 2, 4]], np.float32)))
+    assert numpy_runner(tmp_path / "policy.py")(sample)[1].tolist() == [[7, 3, 4]]
+    with pytest.raises(UserError, match="cannot be exported to torch and ONNX; leave quotes and backslashes"):
+        torch_archive(program, "{}")
+
+
 @pytest.mark.parametrize("near", [0, 2])
 def test_an_export_acts_with_any_number(near: int, tmp_path: Path) -> None:
     trained = drawn_policy("sets", near=near)

@@ -97,6 +97,17 @@ def test_samples_agree_with_the_closed_form_where_there_is_one(monkeypatch: pyte
     torch.testing.assert_close(drawn, exact, rtol=0.05, atol=0.02)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float16])
+def test_samples_at_the_edge_of_a_squash_leave_all_finite(dtype: torch.dtype) -> None:
+    mean = (6 * random(64, 2)).to(dtype).requires_grad_()
+    g = element("rot45", FORCE)
+    gap = policy_divergence(g, squashed(mean, torch.ones_like(mean)), squashed(mean.detach(), torch.ones_like(mean)))
+    gap.sum().backward()
+    assert gap.isfinite().all()
+    assert mean.grad is not None
+    assert mean.grad.isfinite().all()
+
+
 @pytest.mark.parametrize("action", [MOVES, FORCE])
 def test_agents_that_change_places_are_compared_with_themselves(action: ActionSpace) -> None:
     g = element("agents-1-2-0", action, num_agents=3)

@@ -291,6 +291,10 @@ def zeros(*shape: int) -> Tensor:
             r"per_agent\[1\] has shape \[5, 4\], but \[5, 2\] or \[5\] is needed$",
         ),
         (
+            lambda s: s.augment(random(5, 2, 3), zeros(5, 2), per_agent=(torch.ones(5, 2, 4, dtype=torch.int8),)),
+            r"per_agent\[0\] is torch.int8, but an action mask is torch.bool; give mask.bool\(\)",
+        ),
+        (
             lambda s: s.augment(random(5, 2, 3), zeros(5, 2), per_agent=(random(5, 2, 64),)),
             "a stored hidden state cannot be transformed; give whole histories",
         ),

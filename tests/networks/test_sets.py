@@ -212,6 +212,15 @@ def test_an_observation_without_like_things_is_refused():
         network(lonely)
 
 
+@pytest.mark.parametrize("name", ["keys", "a.b"])
+def test_things_whose_name_no_weight_can_have_are_refused(name):
+    spec = scene()[0]
+    seen = layout(*(f for f in spec.observation.fields if not f.family_name), Field("x", Kind.VECTOR, 2, family=name))
+    spaces = Spaces(num_agents=1, observation=seen, state=spec.state, action=spec.action, symmetry="d4")
+    with pytest.raises(UserError, match=f"cannot have things named '{name}'; give this field another name"):
+        network(spaces)
+
+
 def test_wide_own_numbers_are_embedded_once():
     spec = make("wildlife", 2, [0]).spec
     assert Rows(spec.observation, False, 0, False).num_own > 32
