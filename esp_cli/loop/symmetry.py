@@ -258,7 +258,12 @@ class Symmetry(Draws):
                 64 episodes, hold numbers that are not finite, or actions outside.
         """
         from esp_cli.checking import Transitions, candidates, check_transitions, collect  # noqa: PLC0415 - it trains too
+        from esp_envs.base import Environment  # noqa: PLC0415
 
+        if not isinstance(source, Environment | Transitions):
+            raise UserError(
+                f"there is nothing to check in {type(source).__name__}; give a task, or Transitions(obs, ...)"
+            )
         data = source if isinstance(source, Transitions) else collect(source)
         if self.spaces.num_agents == 1 and data.reward.dim() == 2:
             data = data.map(lambda x: x.unsqueeze(2))

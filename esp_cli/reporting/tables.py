@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from typing import TypeVar
 
 from pydantic import JsonValue
@@ -80,9 +81,17 @@ def returns_table(results: Results) -> Table:
     seeds = format_span({len(cell.seeds) for cell in results.cells})
     episodes = format_span({cell.episodes or results.episodes for cell in results.cells})
     caption = f"Mean ± standard error over {seeds} seeds of the {results.mode} return, {episodes} episodes a seed."
-    caption += f" Convention of the returns: {'; '.join(conventions)}." if conventions else ""
+    caption += f" Convention of the returns: {_told_once(conventions)}." if conventions else ""
     headings = ("", *([""] if has_paper else []), *(f"{column}>" for column in columns))
     return Table(results.title, headings, tuple(lines), caption)
+
+
+def _told_once(conventions: Sequence[str]) -> str:
+    """Return conventions one after the other, with what all begin with said once: "team sum; mud 0.9; wind 0.3"."""
+    parts = [convention.split(", ") for convention in conventions]
+    shared = [each[0] for each in takewhile(lambda each: len(set(each)) == 1, zip(*parts, strict=False))]
+    rests = [", ".join(part[len(shared) :]) for part in parts]
+    return "; ".join([", ".join(shared), *rests] if shared and all(rests) else conventions)
 
 
 def comparison_table(results: Results) -> Table:

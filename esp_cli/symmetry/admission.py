@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from esp_cli.symmetry import representation
 from esp_cli.symmetry.elements import AGENTS, Element
 from esp_cli.symmetry.groups import MOST_ITEMS, Group, ProductGroup
@@ -72,8 +74,8 @@ def default_transforms(spaces: Spaces, weighed: bool = False) -> str:
 
     d4 where the task carries it; else the planar part of its symmetry if that can be listed; else c4; else orders of
     its agents or items. Where it declares nothing, d4, which `admit` refuses. Where each element is `weighed` by how
-    nearly it holds, nothing has to be declared: then d4 wherever actions and layouts carry it, and such orders, or
-    elements coupled with some, beside it.
+    nearly it holds, nothing has to be declared: then d4 wherever actions and layouts carry it and it moves one of their
+    numbers, and such orders, or elements coupled with some, beside it.
     """
     if isinstance(spaces, TaskSpec) and spaces.roles:
         own = [default_transforms(role, weighed) for role in spaces.roles]
@@ -81,12 +83,21 @@ def default_transforms(spaces: Spaces, weighed: bool = False) -> str:
     declared = _factors(spaces)
     listed = [name for name in declared[:1] if name != "so2"]
     chosen = next((name for name in ("d4", *listed, "c4", *declared) if carries(name, spaces)), "d4")
-    if not weighed or not carries("d4", unrestricted(spaces)):
+    if not weighed or not carries("d4", unrestricted(spaces)) or not _moves_some_number("d4", spaces):
         return chosen
     found = parse_elements(chosen, spaces.num_agents)
     if isinstance(found, Group) or len(found) > _FEW_ORDERS:
         return "d4"
     return f"d4,{chosen}" if all(element.orders for element in found) else "d4"
+
+
+def _moves_some_number(name: str, spaces: Spaces) -> bool:
+    found = parse_elements(name, spaces.num_agents)
+    elements = found.generators() if isinstance(found, Group) else found
+    seen = representation.rows_operator(spaces.observation, elements, spaces.num_agents)
+    moved = (seen, representation.state_operator(spaces, elements), representation.output_operator(spaces, elements))
+    unlike = [np.sqrt(np.arange(1.0, each.width + 1)) for each in moved]
+    return any(not np.allclose(each.push(numbers), numbers) for each, numbers in zip(moved, unlike, strict=True))
 
 
 def _all_carry(name: str, roles: Sequence[TaskSpec], weighed: bool) -> bool:

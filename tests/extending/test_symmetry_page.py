@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import re
 import sys
 from dataclasses import dataclass, replace
@@ -39,42 +40,7 @@ from tests.cli.running import TINY_OPTIONS, esp, refused
 
 PAGE = Path(__file__).parents[2] / "docs" / "add-a-symmetry.md"
 BLOCKS = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.S)
-WALKERS = '''
-import torch
-from legs import LEGS
-from esp_envs import BatchedTask, Continuous, Field, Items, TaskSettings, TaskSpec, layout
-
-
-class WalkersSettings(TaskSettings):
-    lame: bool = False
-
-
-class Walkers(BatchedTask):
-    """Three robots bring both their knees to the mean of all knees."""
-
-    Settings = WalkersSettings
-
-    def _describe(self):
-        return TaskSpec(
-            name="walkers", version=1, convention="minus the mean square", num_agents=3, horizon=10,
-            symmetry="legs*agents", settings=self.settings.model_dump(),
-            observation=layout(Field("knees", LEGS), Field("others", LEGS, 2, items=Items.OTHERS)),
-            state=layout(Field("knees", LEGS, 3, items=Items.AGENTS)), action=Continuous(layout(Field("torque", LEGS))),
-        )
-
-    def _start(self, generator):
-        return {"knees": self.draw(3, 2, generator=generator)}
-
-    def _advance(self, world, action):
-        force = action * torch.tensor([0.2 if self.settings.lame else 1.0, 1.0])
-        world["knees"] = world["knees"] + 0.3 * force
-        return -(world["knees"] - world["knees"].mean((-2, -1), keepdim=True)).square().mean((-2, -1)), {}
-
-    def _observe(self, world):
-        knees = world["knees"]
-        return torch.stack([torch.cat([knees[:, :, j] for j in (i, *(k for k in range(3) if k != i))], -1)
-                            for i in range(3)], 2)
-'''
+WALKERS = PAGE.with_name("walkers.py").read_text(encoding="utf-8")
 
 
 @pytest.fixture
@@ -143,6 +109,9 @@ def test_a_task_carries_what_it_declares(legs) -> None:
     declared = spaces(legs.LEGS)
     assert carried_groups(declared) == ("legs", "agents")
     assert default_transforms(declared) == "legs"
+    assert default_transforms(declared, weighed=True) == "legs", "d4 leaves legs where they are"
+    with_way = replace(declared, observation=layout(*declared.observation.fields, Field("way", Kind.VECTOR)))
+    assert default_transforms(with_way, weighed=True) == "d4"
     prior = SymmetryPrior(PriorConfig(transforms="swap-legs"), declared)
     batch = SeedBatch(torch.randn(2, 3, 1, 3, 7), torch.randn(2, 3, 1, 6), torch.randn(2, 3, 1, 3, 2))
     swapped = batch.state.unflatten(-1, (3, 2)).flip(-1).flatten(-2)
@@ -179,8 +148,8 @@ def test_what_does_not_commute_or_fit_is_refused(legs, monkeypatch) -> None:
     with pytest.raises(UserError, match=r"swap-legs and rot90 do not commute on field 'knees'"):
         build_transform(parse_elements("rot90*swap-legs", 3), spaces(legs.LEGS))
     monkeypatch.setitem(plane.KIND_MATRICES, legs.LEGS, lambda planar: np.eye(3))
-    with pytest.raises(UserError, match="rot90 transforms 3 numbers of field 'knees', but an item of it has 2"):
-        build_transform(parse_elements("rot90", 3), spaces(legs.LEGS))
+    with pytest.raises(UserError, match="rot45 transforms 3 numbers of field 'knees', but an item of it has 2"):
+        build_transform(parse_elements("rot45", 3), spaces(legs.LEGS))
     monkeypatch.delitem(plane.KIND_MATRICES, legs.LEGS)
     with pytest.raises(UserError, match="does not say how field 'knees' of kind legs turns"):
         build_transform(parse_elements("rot90*swap-legs", 3), spaces(legs.LEGS))
@@ -247,6 +216,9 @@ def test_a_task_trains_with_it_and_its_check_sees_a_lame_leg(legs) -> None:
     esp(*OPTIONS, "--transforms", "legs*agents", "--out", "run")
     esp("train", "--resume", "run", "--task", "walkers:Walkers")
     assert "lacks" not in esp("eval", "run", "--episodes", 4, "--task", "walkers:Walkers").stdout
+    esp(*OPTIONS, "--prior", "auto", "--out", "weighed")
+    weights = json.loads(Path("weighed/config.json").read_text())["prior"]["weights"]
+    assert weights.keys() == {"swap-legs"}, "not of turns, which leave legs alone"
     assert "c8 cannot act on walkers" in refused(*OPTIONS, "--transforms", "c8", "--out", "no")
     for lame, outcome in ((False, 0), (True, 1)):
         said = esp("check", "symmetry", "walkers:Walkers", "--transforms", "legs*agents", "--set", f"task.lame={lame}",

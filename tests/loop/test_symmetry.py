@@ -386,6 +386,8 @@ def test_a_check_says_which_shape_is_needed_and_takes_other_precisions() -> None
         ValueError, match=r"'reward' of the transitions has shape \[64, 3\]; give \[episodes, steps, agen"
     ):
         symmetry.check(team)
+    with pytest.raises(ValueError, match=r"nothing to check in Tensor; give a task, or Transitions\(obs, "):
+        symmetry.check(data.obs)
     with pytest.raises(ValueError, match="'obs' of the transitions has shape"):
         symmetry.check(Transitions(*(part[:, 0] for part in (data.obs, data.action, data.reward, data.next_obs))))
 

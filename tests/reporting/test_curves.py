@@ -11,7 +11,7 @@ from PIL import Image
 
 from esp_cli.reporting.collect import RunCurve, collect_runs, read_curve
 from esp_cli.reporting.study_figures import draw_curves
-from esp_cli.reporting.tables import TABLES
+from esp_cli.reporting.tables import TABLES, _told_once
 from esp_cli.training.run_folder import RunFolder
 from esp_envs.errors import UserError
 from tests.training.runs import tiny_config, tiny_folder
@@ -203,6 +203,12 @@ def test_the_picture_shows_the_curves(tmp_path):
     text = picture.svg.read_text()
     assert all(part in text for part in ("plain", "ESP", "greedy return (esp: team sum", "navigation"))
     assert text.count("<!-- plain") == 1, "one curve, whatever the number of steps"
+
+
+def test_what_all_conventions_begin_with_is_said_once():
+    assert _told_once(["sum, mud 0.9", "sum, wind 0.3"]) == "sum; mud 0.9; wind 0.3"
+    for unlike in (["sum, mud 0.9"], ["sum", "sum, mud 0.9"], ["sum, mud 0.9", "mean, mud 0.9"]):
+        assert _told_once(unlike) == "; ".join(unlike)
 
 
 def test_every_table_compares_at_the_last_step_that_all_runs_reached_and_says_where_each_stands():
