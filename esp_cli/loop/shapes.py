@@ -5,6 +5,7 @@ Whatever does not fit is refused by a `UserError` of one sentence.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, cast
 
@@ -145,6 +146,13 @@ def check_alike(name: str, moved: Iterable[Tensor], here: Tensor) -> None:
                 f"{name} has shape {list(x.shape)} for the moved data, but {list(here.shape)} for the originals "
                 "(here); give both in one shape"
             )
+
+
+def check_rows(spaces: Spaces, gap: Tensor, lead: torch.Size) -> None:
+    """Refuse what a policy says of fewer or more rows and agents than it was given."""
+    needed = (*lead, *_agents(spaces))
+    if gap.numel() != math.prod(needed):
+        raise UserError(f"the policy's outputs have the leading axes {list(gap.shape)}, but {list(needed)} is needed")
 
 
 def mean_counted(gaps: list[Tensor], mask: Tensor | None) -> Tensor:

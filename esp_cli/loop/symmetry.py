@@ -180,12 +180,15 @@ class Symmetry(Draws):
         Raises:
             UserError: a shape that does not fit, or a distribution that is not known.
         """
-        shapes.check_mask(self.spaces, action_mask, lead_of(self.spaces, obs))
+        lead = lead_of(self.spaces, obs)
+        shapes.check_mask(self.spaces, action_mask, lead)
         masks = () if action_mask is None else (action_mask,)
         here = policy(obs, *masks) if here is None else here
         gaps = [
             policy_divergence(g, policy(g.obs(obs), *map(g.push_outputs, masks)), here) for g in self.transforms(obs)
         ]
+        for gap in gaps:
+            shapes.check_rows(self.spaces, gap, lead)
         return mean_counted(gaps, mask)
 
     def value_loss(

@@ -312,6 +312,10 @@ def zeros(*shape: int) -> Tensor:
         (lambda s: s.value_loss(lambda x: x), "takes either state or obs"),
         (lambda s: s.value_loss(lambda x: x, random(5, 6)), r"value has shape \[5, 6\], but \[5, 2\] or \[5\]"),
         (lambda s: s.policy_loss(lambda o: o, random(5, 2, 3)), r"shape \[5, 2, 3\], but there are 4 actions"),
+        (
+            lambda s: s.policy_loss(lambda o: torch.zeros(5, 4), random(5, 2, 3)),
+            r"the policy's outputs have the leading axes \[5\], but \[5, 2\] is needed",
+        ),
         (lambda s: s.policy_loss(lambda o: (o, o), random(5, 2, 3)), "a stored hidden state cannot be transformed"),
     ],
 )
