@@ -22,7 +22,7 @@ class RolesPolicy(Policy):
         self.num_seeds = next(iter(policies.values())).num_seeds
         self.num_agents, self._parts = spec.num_agents, spec.parts
         for name, policy in policies.items():
-            if hasattr(self, name):
+            if hasattr(self, name) or hasattr(nn.ModuleDict, name):  # learners with targets keep these in one
                 raise UserError(f"a role cannot be named '{name}', which means something of a policy; rename it")
             self.add_module(name, policy)
 

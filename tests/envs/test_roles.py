@@ -5,6 +5,7 @@
 import json
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -15,6 +16,7 @@ from esp_cli import Symmetry, load_policy
 from esp_cli.app import app
 from esp_cli.checking import check_symmetry
 from esp_cli.checking.measured import prepared
+from esp_cli.networks.roles import RolesPolicy
 from esp_cli.policies.evaluation import evaluate
 from esp_cli.policies.loading import open_policy
 from esp_cli.run import begin
@@ -212,6 +214,12 @@ def test_every_algorithm_trains_both_roles_and_goes_on_bit_for_bit(algorithm):
     assert all(torch.equal(tensor, expected[name]) for name, tensor in again.state_dict().items())
     policies = list(whole.policy.children())
     assert not torch.equal(*(next(policy.parameters())[..., :1, :2].flatten()[:2] for policy in policies))
+
+
+@pytest.mark.parametrize("name", ["act", "keys"])
+def test_a_role_whose_name_means_something_of_a_policy_is_refused(name):
+    with pytest.raises(UserError, match=f"a role cannot be named '{name}', which means something of a policy"):
+        RolesPolicy(SimpleNamespace(num_agents=1, parts=()), {name: SimpleNamespace(num_seeds=1)})
 
 
 def test_the_prior_acts_in_each_role():
