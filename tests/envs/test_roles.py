@@ -344,6 +344,7 @@ def test_roles_of_names_that_say_nothing_are_listed():
         make_it(Listed)
 
 
+@pytest.mark.usefixtures("few_states")
 @pytest.mark.parametrize("transforms", ["d4*agents", "agents", "d4,agents"])
 def test_orders_of_agents_are_left_out_of_a_role_of_one_that_is_weighed(transforms):
     overrides = {"task.control": "both", "prior.kind": "auto", "prior.transforms": transforms, "mappo.num_envs": 4}

@@ -25,9 +25,9 @@ from tests.cli.running import esp, refused
 from tests.learning.golden import digest
 from tests.prior.test_copies import SPACES, Squared, rows
 
-_OFF_POLICY = "--set maddpg.num_envs=2 --set maddpg.warmup_episodes=2 --set maddpg.batch_episodes=4 --steps 500"
+_OFF_POLICY = "--set maddpg.num_envs=2 --set maddpg.warmup_episodes=2 --set maddpg.batch_episodes=4 --steps 300"
 SMALL = {
-    "mappo": "--set mappo.num_envs=8 --set mappo.num_epochs=3 --steps 2400",
+    "mappo": "--set mappo.num_envs=8 --set mappo.num_epochs=3 --set mappo.num_minibatches=1 --steps 1200",
     "maddpg": f"--algo maddpg {_OFF_POLICY}",
     "qmix": f"--algo qmix {_OFF_POLICY.replace('maddpg', 'qmix')}",
 }

@@ -46,8 +46,8 @@ from tests.training.runs import TINY
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 STORE = 80 * 2**20
-STEPS = 9000
-"""180 iterations: time enough to lose something in the middle."""
+STEPS = 6000
+"""120 iterations: time enough to lose something in the middle."""
 
 
 @pytest.fixture(scope="module")
@@ -296,7 +296,7 @@ def test_a_search_on_a_cluster_goes_on_after_a_stop_and_scores_as_on_this_machin
     from esp_cli.studies.search import Outcome, Search
 
     monkeypatch.setenv("ESP_CHECKPOINT_SECONDS", "0")
-    asked = tuning(priors=("esp",), budget=2, steps=4 * STEPS)  # long enough to be stopped on the way
+    asked = tuning(priors=("esp",), budget=2, steps=2 * STEPS)  # long enough to be stopped on the way
 
     def searched(path: Path, engine: Engine) -> Outcome:
         first = path / "trials" / "esp-000"
