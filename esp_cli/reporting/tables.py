@@ -81,17 +81,17 @@ def returns_table(results: Results) -> Table:
     seeds = format_span({len(cell.seeds) for cell in results.cells})
     episodes = format_span({cell.episodes or results.episodes for cell in results.cells})
     caption = f"Mean ± standard error over {seeds} seeds of the {results.mode} return, {episodes} episodes a seed."
-    caption += f" Convention of the returns: {_told_once(conventions)}." if conventions else ""
+    caption += f" Convention: {_told_once(conventions)}." if conventions else ""
     headings = ("", *([""] if has_paper else []), *(f"{column}>" for column in columns))
     return Table(results.title, headings, tuple(lines), caption)
 
 
 def _told_once(conventions: Sequence[str]) -> str:
-    """Return conventions one after the other, with what all begin with said once: "team sum; mud 0.9; wind 0.3"."""
-    parts = [convention.split(", ") for convention in conventions]
-    shared = [each[0] for each in takewhile(lambda each: len(set(each)) == 1, zip(*parts, strict=False))]
-    rests = [", ".join(part[len(shared) :]) for part in parts]
-    return "; ".join([", ".join(shared), *rests] if shared and all(rests) else conventions)
+    """Return conventions one after the other, with what all begin with said once: "esp: sum; mud 0.9; wind 0.3"."""
+    parts = [re.findall(r".+?(?:[:,] |$)", convention) for convention in conventions]
+    shared = "".join(each[0] for each in takewhile(lambda each: len(set(each)) == 1, zip(*parts, strict=False)))
+    rests = [convention.removeprefix(shared) for convention in conventions]
+    return re.sub(", $", "; ", shared) + "; ".join(rests) if all(rests) else "; ".join(conventions)
 
 
 def comparison_table(results: Results) -> Table:

@@ -125,7 +125,7 @@ def test_unlike_numbers_of_episodes_are_told(finished: Path, copied: Path, tmp_p
     (copied / "config.json").write_text(json.dumps(config))
     esp("report", finished, copied, "--out", tmp_path / "page")
     text = (tmp_path / "page" / "report.md").read_text()
-    assert f"greedy return, {fewer} to {5 * fewer} episodes a seed. Convention of the returns: esp: team sum" in text
+    assert f"greedy return, {fewer} to {5 * fewer} episodes a seed. Convention: esp: team sum" in text
     esp("report", copied, "--out", tmp_path / "alone")
     assert f"greedy return, {5 * fewer} episodes a seed." in (tmp_path / "alone" / "report.md").read_text()
 
