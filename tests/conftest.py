@@ -66,18 +66,6 @@ def few_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def few_states(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Let weights of elements be measured in fewer states; tests of checks ask what is told of how many."""
-    from esp_cli.checking import measured, paired
-
-    monkeypatch.setattr(paired, "_MOST_WORLDS", paired._FEWEST_WORLDS)
-    monkeypatch.setattr(paired, "_LATER", 16)
-    measured._breaking.cache_clear()
-    yield
-    measured._breaking.cache_clear()
-
-
-@pytest.fixture
 def full_disk() -> Callable[[], AbstractContextManager[None]]:
     """Return a context in which files of this process can grow no further, as on a full disk."""
 

@@ -52,7 +52,7 @@ def export(
         raise UserError(f"there is no format '{unknown}'; the formats are {', '.join(FORMATS)}")
     if seed is not None and episodes is not None:
         raise UserError("--episodes finds the best seed, and --seed names one; leave one of them out")
-    from esp_cli.export.export import made, put, refuse_taken
+    from esp_cli.export.export import export_all, refuse_taken
     from esp_cli.policies.loading import open_policy
 
     options.register_named(task, [algo], network)
@@ -60,13 +60,10 @@ def export(
     for text in trained.notes:
         console.note(text)
     parts = {role.name: trained.of_role(role.name) for role in trained.spec.roles} or {"": trained}
-    for role in parts:
-        refuse_taken(out / role, formats, force)
+    refuse_taken([out / role for role in parts], formats, force)  # before the work
     chosen = _best(trained, episodes or EPISODES) if seed is None else seed
-    ready = {role: made(part.single_seed(chosen), formats) for role, part in parts.items()}
-    for role, (_, files) in ready.items():  # all of them, or none
-        put(files, out / role)
-    written = {role: exported for role, (exported, _) in ready.items()}
+    exported = export_all({out / role: part.single_seed(chosen) for role, part in parts.items()}, formats, force)
+    written = {role: exported[out / role] for role in parts}
 
     def show() -> None:
         for role, one in written.items():

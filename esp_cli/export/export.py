@@ -6,7 +6,7 @@ A format is one entry of `FORMATS`; `templates/README.md.jinja` says how its fil
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -109,13 +109,21 @@ FORMATS = {
 
 def export(trained: TrainedPolicy, formats: Sequence[str], folder: Path, force: bool = False) -> Exported:
     """Write one seed's policy in some formats, with `policy.json` and a README, after checking each."""
-    refuse_taken(folder, formats, force)
-    exported, files = made(trained, formats)
-    put(files, folder)
-    return exported
+    return export_all({folder: trained}, formats, force)[folder]
 
 
-def made(trained: TrainedPolicy, formats: Sequence[str]) -> tuple[Exported, Files]:
+def export_all(
+    policies: Mapping[Path, TrainedPolicy], formats: Sequence[str], force: bool = False
+) -> dict[Path, Exported]:
+    """Write policies into a folder each, as of a task's roles: all of them or, where one cannot be, none."""
+    refuse_taken(policies, formats, force)
+    ready = {folder: _made(trained, formats) for folder, trained in policies.items()}
+    for folder, (_, files) in ready.items():
+        _put(files, folder)
+    return {folder: exported for folder, (exported, _) in ready.items()}
+
+
+def _made(trained: TrainedPolicy, formats: Sequence[str]) -> tuple[Exported, Files]:
     """Make the files of an export and check each format; nothing is written yet."""
     formats = tuple(dict.fromkeys(formats))
     program = program_of(trained.policy, trained.spec.masks)
@@ -132,17 +140,20 @@ def made(trained: TrainedPolicy, formats: Sequence[str]) -> tuple[Exported, File
     return Exported(results, job.program.num_parameters), written
 
 
-def refuse_taken(folder: Path, formats: Sequence[str], force: bool) -> None:
-    """Refuse a file in the folder's place and, unless forced, files in the place of those of an export."""
-    if folder.exists() and not folder.is_dir():
-        raise UserError(f"{folder} is a file; name a folder for the export with --out")
+def refuse_taken(folders: Iterable[Path], formats: Sequence[str], force: bool) -> None:
+    """Refuse a file in a folder's place and, unless forced, files in the place of those of an export."""
     names = ["README.md", DESCRIPTION, *(file for name in formats for file in FORMATS[name].files)]
-    taken = [name for name in dict.fromkeys(names) if (folder / name).exists()]
-    if taken and not force:
-        raise UserError(f"{folder} has {', '.join(taken)} already; choose another --out, or replace it with --force")
+    for folder in folders:
+        if folder.exists() and not folder.is_dir():
+            raise UserError(f"{folder} is a file; name a folder for the export with --out")
+        taken = [name for name in dict.fromkeys(names) if (folder / name).exists()]
+        if taken and not force:
+            raise UserError(
+                f"{folder} has {', '.join(taken)} already; choose another --out, or replace it with --force"
+            )
 
 
-def put(files: Files, folder: Path) -> None:
+def _put(files: Files, folder: Path) -> None:
     """Put files into a folder, each as a whole, in the place of all files of an export that is there."""
     folder.mkdir(parents=True, exist_ok=True)
     for name in _exported(folder) - files.keys():

@@ -150,8 +150,9 @@ class SetEncoder(nn.Module):
         self.num_own = features if self.own else rows.num_own
         self.embed = nn.ModuleDict()
         for family, width in zip(rows.families, rows.widths, strict=True):
+            embedding = Embedding(generators, (width + self.num_own, features, features), config)
             try:
-                self.embed[family.name] = Embedding(generators, (width + self.num_own, features, features), config)
+                self.embed[family.name] = embedding
             except KeyError:  # it cannot be part of a weight's name
                 raise UserError(
                     f"a network over sets cannot have things named '{family.name}'; give this field another name"

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from esp_cli.symmetry import representation
 from esp_cli.symmetry.elements import AGENTS, Element
 from esp_cli.symmetry.groups import MOST_ITEMS, Group, ProductGroup
+from esp_cli.symmetry.maps import map_of
 from esp_cli.symmetry.parse import declared_factors, is_item_name, parse_elements, rank
 from esp_envs.errors import UserError
 from esp_envs.roles import without_agents
@@ -40,7 +39,7 @@ def admit(text: str, elements: Sequence[Element] | Group, spaces: Spaces, instea
     It cannot where some action's image is no action, the element is outside the task's declared symmetry, or agents or
     items are to change places and a layout does not say which numbers follow them.
     """
-    moved = elements.generators() if isinstance(elements, Group) else tuple(elements)
+    moved = _generating(elements)
     reason = _reason(_require, moved, spaces)
     if reason is None:
         return
@@ -92,12 +91,10 @@ def default_transforms(spaces: Spaces, weighed: bool = False) -> str:
 
 
 def _moves_some_number(name: str, spaces: Spaces) -> bool:
-    found = parse_elements(name, spaces.num_agents)
-    elements = found.generators() if isinstance(found, Group) else found
+    elements = _generating(parse_elements(name, spaces.num_agents))
     seen = representation.rows_operator(spaces.observation, elements, spaces.num_agents)
     moved = (seen, representation.state_operator(spaces, elements), representation.output_operator(spaces, elements))
-    unlike = [np.sqrt(np.arange(1.0, each.width + 1)) for each in moved]
-    return any(not np.allclose(each.push(numbers), numbers) for each, numbers in zip(moved, unlike, strict=True))
+    return not all(map_of(each).is_identity for each in moved)
 
 
 def _all_carry(name: str, roles: Sequence[TaskSpec], weighed: bool) -> bool:
@@ -170,8 +167,12 @@ def declares(symmetry: str, num_agents: int) -> Callable[[Element], bool]:
 
 def carries(name: str, spaces: Spaces) -> bool:
     """Return whether a task's actions, layouts and declared symmetry carry elements or a group, by name."""
-    found = parse_elements(name, spaces.num_agents)
-    return _reason(_require, found.generators() if isinstance(found, Group) else found, spaces) is None
+    return _reason(_require, _generating(parse_elements(name, spaces.num_agents)), spaces) is None
+
+
+def _generating(elements: Sequence[Element] | Group) -> tuple[Element, ...]:
+    """Return elements whose products are all that is meant: a group's generators."""
+    return tuple(elements.generators() if isinstance(elements, Group) else elements)
 
 
 def _reason(check: Callable[..., object], *args: object) -> str | None:
