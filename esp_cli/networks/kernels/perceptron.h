@@ -223,19 +223,20 @@ void pull_block(const Layout &net, int64_t seed, Span span, bool add, const floa
     copy(span.size(), columns, {here, padded(columns), 1}, to, columns, 1);
 }
 
-// Add the sums of a seed's parts to its gradients [P].
-void add_up(const Layout &net, const float *from, float *gradients) {
-    for (int64_t part = 0; part < net.shares.parts; part++) {
-        float *to = gradients;
-        for (int64_t k = 0; k < net.layers; k++) {
-            int64_t in = net.in(k), out = net.out(k);
-            int64_t row = net.turned(k) ? 1 : padded(out), column = net.turned(k) ? padded(in) : 1;
-            for (int64_t i = 0; i < in; i++)
-                for (int64_t o = 0; o < out; o++, to++) *to = from[i * row + o * column] + (part ? *to : 0.0f);
-            from += net.weight_room(k);
-            for (int64_t o = 0; o < out; o++, to++) *to = from[o] + (part ? *to : 0.0f);
-            from += padded(out);
-        }
+// Add up the sums of a seed's parts, `room` numbers each, in the first of them, and write its gradients [P].
+void add_up(const Layout &net, int64_t room, float *sums, float *gradients) {
+    for (int64_t i = 0; i < room; i += LANES) {
+        Vec total = vec(sums + i);
+        for (int64_t part = 1; part < net.shares.parts; part++) total += vec(sums + part * room + i);
+        vec(sums + i) = total;
+    }
+    for (int64_t k = 0; k < net.layers; k++) {
+        int64_t in = net.in(k), out = net.out(k);
+        Matrix by_weight{sums, net.turned(k) ? 1 : padded(out), net.turned(k) ? padded(in) : 1};
+        copy(in, out, by_weight, gradients, out, 1);
+        sums += net.weight_room(k), gradients += in * out;
+        std::copy(sums, sums + out, gradients);
+        sums += padded(out), gradients += out;
     }
 }
 
@@ -271,7 +272,8 @@ void pull(const Layout &net, float *by_parameters, const Below &below, Prepare p
             });
         },
         [&](int64_t s) {
-            if (by_parameters) add_up(net, sums.get() + s * net.shares.parts * sum_room, by_parameters + s * count);
+            if (by_parameters)
+                add_up(net, sum_room, sums.get() + s * net.shares.parts * sum_room, by_parameters + s * count);
         });
 }
 
