@@ -16,7 +16,6 @@ from esp_cli.commands import options
 from esp_cli.commands.counts import chosen_seeds
 from esp_cli.console.progress import stop_requests
 from esp_cli.defaults import STEPS, PriorKind
-from esp_cli.networks.kernels.library import WORTH_COMPILING, begin
 from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
@@ -92,6 +91,8 @@ def train(
     no_check: options.NoCheckOption = False,
 ) -> None:
     """Train S seeds of one task, algorithm, network and prior at once, with live progress."""
+    from esp_cli.networks.kernels.library import WORTH_COMPILING, begin
+
     named = options.parse_assignments(settings or [])
     compiled = named.get("network.compiled", "auto")
     is_worth_it = steps >= WORTH_COMPILING and device != "cuda" and resume is None and not print_config
