@@ -48,6 +48,12 @@ def example_source(program: Program, example: dict[str, Any]) -> bytes:
     return filled("policy_example.c", **given, numbers=numbers)
 
 
+def of_role(source: bytes, role: str | None) -> bytes:
+    """Return a source whose names have that of a role, so that one program may have the policies of all roles."""
+    name = re.sub(r"\W", "_", role or "policy", flags=re.ASCII)
+    return source.replace(b"esp_policy", f"esp_{name}".encode()).replace(b"ESP_POLICY", f"ESP_{name}".upper().encode())
+
+
 def _returns(program: Program) -> bool:
     """Whether the function that acts returns the action, a single choice; else it writes it."""
     return program.head == "choose" and program.team == 1
@@ -93,8 +99,9 @@ def c_runner(file: Path, program: Program) -> Runner:
     """Compile a written C source and call it row by row, or of a team world by world."""
     code = ctypes.CDLL(str(_compiled(file.with_suffix(".so"), "-shared", "-fPIC", file)))
     returns, team, width = _returns(program), program.team, program.num_outputs
-    code.esp_policy_outputs.restype = ctypes.POINTER(ctypes.c_float)
-    code.esp_policy_act.restype = ctypes.c_int if returns else None
+    name = re.findall(r"(\w+)_act\(const", file.with_suffix(".h").read_text())[0]
+    act, outputs_of = code[f"{name}_act"], code[f"{name}_outputs"]
+    act.restype, outputs_of.restype = ctypes.c_int if returns else None, ctypes.POINTER(ctypes.c_float)
 
     def run(sample: Sample) -> tuple[Numbers, Numbers, Numbers]:
         obs, after = np.ascontiguousarray(sample.obs), sample.memory.copy()
@@ -105,11 +112,11 @@ def c_runner(file: Path, program: Program) -> Runner:
         arrays += [after] * (program.memory_width > 0) + [action] * (not returns)
         for k in range(0, len(obs), team):
             given = [part for table in tables for part in (table[k:].ctypes, table.shape[1])]
-            chosen = code.esp_policy_act(obs[k:].ctypes, *given, *(array[k:].ctypes for array in arrays))
+            chosen = act(obs[k:].ctypes, *given, *(array[k:].ctypes for array in arrays))
             if returns:
                 action[k] = chosen
             for i in range(team):
-                outputs[k + i] = np.ctypeslib.as_array(code.esp_policy_outputs(*[i] * (team > 1)), (width,))
+                outputs[k + i] = np.ctypeslib.as_array(outputs_of(*[i] * (team > 1)), (width,))
         return action, outputs, after
 
     return run

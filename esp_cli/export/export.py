@@ -72,7 +72,8 @@ class Exported:
 
 def _c(job: Job) -> Files:
     example = {"policy_example.c": c_file.example_source(job.program, job.description["example"])}
-    return c_file.c_source(job.program, _summary(job)) | example
+    files = c_file.c_source(job.program, _summary(job)) | example
+    return {name: c_file.of_role(source, job.trained.role) for name, source in files.items()}
 
 
 def _numpy(job: Job) -> Files:
@@ -191,7 +192,7 @@ def _checked(name: str, files: Files, job: Job) -> Export:
 
 def _readme(job: Job, results: Sequence[Export]) -> bytes:
     settings, example = job.trained.spec.settings, job.description["example"]
-    return filled(
+    readme = filled(
         "README.md",
         **job.words,
         example=[(k, shortly(v)) for k, v in example.items() if not k.startswith(("memory", "sets"))],
@@ -200,3 +201,4 @@ def _readme(job: Job, results: Sequence[Export]) -> bytes:
         robot=None if job.scenes is None else job.description["robot"],
         seen_robots=0 if job.scenes is None else epuck.seen_robots(settings),
     )
+    return c_file.of_role(readme, job.trained.role)

@@ -3,6 +3,8 @@
 # ruff: noqa: RUF012  (as users write a task)
 
 import json
+import shutil
+import subprocess
 import threading
 from pathlib import Path
 from types import SimpleNamespace
@@ -257,6 +259,25 @@ def test_a_run_is_trained_and_evaluated_and_each_roles_policy_acts_and_is_export
     told = CALL.invoke(app, ["export", str(tmp_path / "run"), "--seed", "1", "-f", "numpy", "-o", str(out)])
     assert told.exit_code == 2, "the place of the prey is taken"
     assert not any((out / "hunter").iterdir()), "so nothing is written of the hunter either"
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
+def test_one_program_in_c_has_the_policies_of_all_roles(tmp_path: Path):
+    begin(short(), None, tmp_path / "run").train()
+    told = CALL.invoke(app, ["export", str(tmp_path / "run"), "--seed", "1", "-f", "c", "-o", str(tmp_path / "out")])
+    assert told.exit_code == 0, told.output
+    main = tmp_path / "main.c"
+    main.write_text(
+        '#include "out/hunter/policy.h"\n#include "out/prey/policy.h"\n#include <stdio.h>\n'
+        "int main(void) { const float seen[ESP_HUNTER_OBSERVATION] = {0.0f, 3.0f, 1.0f};\n"
+        'printf("%d %d", esp_hunter_act(seen), esp_prey_act(seen)); return 0; }\n'
+    )
+    sources = [str(tmp_path / "out" / role / "policy.c") for role in ("hunter", "prey")]
+    subprocess.run(["cc", str(main), *sources, "-lm", "-o", str(tmp_path / "both")], check=True)
+    said = subprocess.run([str(tmp_path / "both")], check=True, capture_output=True, text=True).stdout
+    policies = [load_policy(tmp_path / "run", seed=1, role=role) for role in ("hunter", "prey")]
+    assert [int(number) for number in said.split()] == [int(one.act([[0.0, 3.0, 1.0]])[0]) for one in policies]
+    assert "`esp_prey_act(observation" in (tmp_path / "out" / "prey" / "README.md").read_text()
 
 
 def test_what_a_command_says_of_each_role(tmp_path: Path):
