@@ -20,7 +20,7 @@ from esp_cli.algorithms.off_policy import ExploringConfig, ExploringLearner
 from esp_cli.algorithms.replay import EpisodeBatch
 from esp_cli.networks.build import perceptron
 from esp_cli.networks.contract import Generators, IoSpec, NetworkConfig
-from esp_cli.networks.exploration import ActorHead, ExploringCategorical, build_actor_head
+from esp_cli.networks.exploration import ActorHead, BoundedPoint, ExploringCategorical
 from esp_cli.networks.heads import drawn
 from esp_cli.networks.joint_q import PerAgentCriticInput
 from esp_cli.networks.plain import MLP
@@ -93,7 +93,8 @@ class Maddpg(ExploringLearner):
 
     @classmethod
     def build_policy(cls, spec: TaskSpec, network: NetworkConfig, generators: Generators) -> HistoryPolicy:
-        return HistoryPolicy(spec, network, generators, build_actor_head(spec.action, len(generators)), POLICY_GAIN)
+        kind = ExploringCategorical if isinstance(spec.action, Discrete) else BoundedPoint
+        return HistoryPolicy(spec, network, generators, kind(spec.action, len(generators)), POLICY_GAIN)
 
     def update(self, batch: EpisodeBatch) -> dict[str, Tensor]:
         """Take one gradient step of the critic, then one of the actor, then move the targets."""

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import huber_loss
 
 from esp_cli.networks.kernels.choices import Clipped
-from esp_cli.networks.kernels.values import Regression
+from esp_cli.networks.kernels.perceptron import Regression
 from esp_cli.networks.policies import CompiledCategoricalPolicies, Policies
 from esp_cli.prior import Copies, Loss, Term, mean_per_seed, shares
 from esp_cli.prior.losses import Stated, Values

@@ -17,7 +17,7 @@ from esp_cli.commands.study_progress import StudyProgress
 from esp_cli.files.formatting import format_count
 
 if TYPE_CHECKING:
-    from esp_cli.studies.scheduler import Snapshot
+    from esp_cli.studies.scheduler import Scheduler
     from esp_cli.studies.study import Study, StudyFolder
 
 EPILOG = """Examples:\n
@@ -85,11 +85,11 @@ class LiveCurves(StudyProgress):
         super().__init__()
         self._folder, self._told = folder, 0
 
-    def update(self, snapshot: Snapshot) -> None:
+    def update(self, scheduler: Scheduler) -> None:
         from esp_cli.studies.tuning import curve_of
         from esp_cli.training.folder_names import METRICS
 
-        super().update(snapshot)
+        super().update(scheduler)
         evaluations = {c.variant: curve_of(self._folder.run_path(c) / METRICS) for c in self._folder.study.cells}
         curves = {name: [(one.step, one.mean) for one in points] for name, points in evaluations.items()}
         if self._live is not None:

@@ -64,7 +64,6 @@ def _forecast(benchmark: Benchmark, choices: StudyChoices) -> None:
 
 
 def _judge(benchmark: Benchmark, choices: StudyChoices) -> None:
-    from esp_cli.studies.scheduler import Scheduler
     from esp_cli.studies.study import StudyFolder
     from esp_cli.studies.symmetry import Trials
     from esp_cli.training.folder_names import FRESH
@@ -77,10 +76,7 @@ def _judge(benchmark: Benchmark, choices: StudyChoices) -> None:
         stop_requests("stopping every run after its iteration") as requests,
     ):
         trials = Trials.create(out, planned)
-        trials.check = resources.check
-        failed = studying.follow(
-            Scheduler(trials, trials.cells_of(planned), resources.jobs, resources.engine), requests
-        )
+        failed = studying.follow(trials, trials.cells_of(planned), resources, requests)
         if not (requests or failed):
             study = benchmark.judged(trials)
             fresh = StudyFolder.create(out / FRESH, study)

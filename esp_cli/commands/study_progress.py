@@ -14,14 +14,14 @@ from esp_cli.console.progress import LiveProgress
 from esp_cli.files.formatting import format_standing
 
 if TYPE_CHECKING:
-    from esp_cli.studies.scheduler import Run, Snapshot
+    from esp_cli.studies.scheduler import Run, Scheduler
 
 LINE_INTERVAL_S = 60.0  # seconds between two plain lines where standard error is no terminal
 _SAID = {"training": "training", "evaluating": "evaluating", "elsewhere": "waiting for", "finished": "finished"}
 
 
 class StudyProgress:
-    """Shows snapshots of a scheduler; a test has a clock of its own."""
+    """Shows how far a scheduler is; a test has a clock of its own."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock, self._last_line_s = clock, -math.inf
@@ -39,20 +39,20 @@ class StudyProgress:
         if self._live is not None:
             self._live.stop()
 
-    def update(self, snapshot: Snapshot) -> None:
+    def update(self, scheduler: Scheduler) -> None:
         """Show where all runs are; what changed since the last time is said in a line of its own."""
-        self._say_changes(snapshot)
+        self._say_changes(scheduler)
         if self._live is not None:
-            self._draw(self._live, snapshot)
+            self._draw(self._live, scheduler)
         elif (now := self._clock()) - self._last_line_s >= LINE_INTERVAL_S:
             self._last_line_s = now
-            for run in snapshot.runs:
+            for run in scheduler.runs:
                 if run.is_active:
                     console.note(f"  {run.cell.name}  {run_status(run)}")
-            console.note(whole_status(snapshot))
+            console.note(whole_status(scheduler))
 
-    def _say_changes(self, snapshot: Snapshot) -> None:
-        for run in snapshot.runs:
+    def _say_changes(self, scheduler: Scheduler) -> None:
+        for run in scheduler.runs:
             name, before = run.cell.name, self._seen.get(run.cell.name)
             self._seen[name] = run.status
             if before == run.status or (before is None and run.status in ("waiting", "finished")):
@@ -66,8 +66,8 @@ class StudyProgress:
                 elsewhere = ", which another process still trains" if run.status == "elsewhere" else ""
                 console.note(f"{_SAID[run.status]} {name}{spent}{elsewhere}")
 
-    def _draw(self, live: LiveProgress, snapshot: Snapshot) -> None:
-        for run in snapshot.runs:
+    def _draw(self, live: LiveProgress, scheduler: Scheduler) -> None:
+        for run in scheduler.runs:
             name = run.cell.name
             if run.is_active and name not in self._bars:
                 self._bars[name] = live.add_task("", total=run.cell.config.steps, status=name)
@@ -76,13 +76,13 @@ class StudyProgress:
                     live.update(self._bars[name], completed=run.step, status=f"{run_status(run)}  {name}")
                 else:
                     live.remove_task(self._bars.pop(name))
-        live.update(self._total, completed=share(snapshot), status=f"{whole_status(snapshot)}  whole study")
+        live.update(self._total, completed=share(scheduler), status=f"{whole_status(scheduler)}  whole study")
 
 
-def share(snapshot: Snapshot) -> float:
+def share(scheduler: Scheduler) -> float:
     """Return the share of all environment steps that is done."""
-    total = sum(run.cell.config.steps for run in snapshot.runs)
-    done = sum(run.cell.config.steps if run.status == "finished" else run.step for run in snapshot.runs)
+    total = sum(run.cell.config.steps for run in scheduler.runs)
+    done = sum(run.cell.config.steps if run.status == "finished" else run.step for run in scheduler.runs)
     return done / total if total else 1.0
 
 
@@ -93,10 +93,10 @@ def run_status(run: Run) -> str:
     return format_standing(run.step, run.cell.config.steps, run.rate, len(run.cell.config.seeds))
 
 
-def whole_status(snapshot: Snapshot) -> str:
+def whole_status(scheduler: Scheduler) -> str:
     """Return how many runs are done, and the time left of the whole study, in one line."""
-    left = "?" if snapshot.left_s is None else console.format_duration(snapshot.left_s)
-    failed = snapshot.count("failed")
-    parts = [f"{share(snapshot):.0%}", f"{snapshot.count('finished')}/{len(snapshot.runs)} runs finished"]
+    seconds, failed = scheduler.left_s(), scheduler.count("failed")
+    left = "?" if seconds is None else console.format_duration(seconds)
+    parts = [f"{share(scheduler):.0%}", f"{scheduler.count('finished')}/{len(scheduler.runs)} runs finished"]
     parts += [f"{failed} failed"] if failed else []
     return "  ".join([*parts, f"{left} left"])

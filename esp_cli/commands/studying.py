@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from esp_cli.studies.catalogue import Request
     from esp_cli.studies.engine import Engine
     from esp_cli.studies.forecast import Forecast
-    from esp_cli.studies.scheduler import Scheduler, Snapshot
+    from esp_cli.studies.run_set import Cell, RunSet
+    from esp_cli.studies.scheduler import Scheduler
     from esp_cli.studies.study import Study, StudyFolder
     from esp_cli.training.config import RunConfig
 
@@ -178,30 +179,35 @@ def run_cells(
 
     Of cells that train the same, one is run. `requests` is not empty once the user asks to stop.
     """
-    from esp_cli.studies.scheduler import Scheduler
-
-    folder.check, cells = resources.check, folder.cells_of(study)
+    cells = folder.cells_of(study)
     for cell, twin in folder.adopt_finished(cells, resources.reused):
         console.note(f"taking over {twin} as {cell.name}")
-    runs = folder.unlike(cells)
-    scheduler = Scheduler(folder, runs, min(resources.jobs, len(runs)), resources.engine)
-    failed = follow(scheduler, requests, progress)
+    failed = follow(folder, folder.unlike(cells), resources, requests, progress)
     for cell, twin in folder.adopt_finished(cells, [folder]):
         console.note(f"taking over {twin} as {cell.name}, which trains the same")
     return failed
 
 
-def follow(scheduler: Scheduler, requests: Sequence[int], progress: StudyProgress | None = None) -> list[str]:
-    """Run a scheduler with live progress, by default a bar for each run, and return the names of runs that failed."""
-    finished, folder = sum(run.status == "finished" for run in scheduler.runs), scheduler.folder
+def follow(
+    folder: RunSet,
+    cells: Sequence[Cell],
+    resources: Resources,
+    requests: Sequence[int],
+    progress: StudyProgress | None = None,
+) -> list[str]:
+    """Run cells of a study or search with live progress, by default a bar for each; return the names of the failed."""
+    from esp_cli.studies.scheduler import Scheduler
+
+    folder.check = resources.check
+    scheduler = Scheduler(folder, cells, min(resources.jobs, len(cells)), resources.engine)
     console.note(
-        f"{folder.title}: {len(scheduler.runs)} runs, {finished} of them finished, {scheduler.jobs} side by side -> "
-        f"{folder.path}"
+        f"{folder.title}: {len(cells)} runs, {scheduler.count('finished')} of them finished, {scheduler.jobs} side by "
+        f"side -> {folder.path}"
     )
     with progress or StudyProgress() as shown:
 
-        def listen(snapshot: Snapshot) -> bool:
-            shown.update(snapshot)
+        def listen(scheduler: Scheduler) -> bool:
+            shown.update(scheduler)
             return not requests
 
         scheduler.run(listen)

@@ -106,7 +106,6 @@ def _tune(tuning: Tuning, request: Request, choices: StudyChoices) -> None:
         from esp_cli.studies.search import Search
     except ImportError:
         raise UserError(f"Optuna is not installed: {install('tune')}") from None
-    from esp_cli.studies.scheduler import Scheduler
     from esp_cli.studies.study import StudyFolder
     from esp_cli.studies.tuning import fresh_study
     from esp_cli.training.folder_names import FRESH
@@ -121,8 +120,7 @@ def _tune(tuning: Tuning, request: Request, choices: StudyChoices) -> None:
         if StudyFolder.is_one(judged):  # of a search that goes on: other seeds are refused before it does
             StudyFolder.planned(judged, fresh_study(tuning, {}, request.seeds, request.episodes))
         search = Search.create(out, tuning)
-        search.check = resources.check
-        failed = studying.follow(Scheduler(search, search.cells, resources.jobs, resources.engine), requests)
+        failed = studying.follow(search, search.cells, resources, requests)
         outcomes = [search.outcome(prior) for prior in tuning.priors]
         best = {found.prior: (found.best, found.settings) for found in outcomes if found.best is not None}
         _report(search, outcomes, quiet=choices.json == "-")

@@ -16,7 +16,7 @@ from torch.nn.functional import mse_loss
 
 from esp_cli.networks.heads import MASKED, Bounded, Categorical, Choice, Head, best, drawn, squash
 from esp_envs.base import random_choice
-from esp_envs.spec import ActionSpace, Discrete
+from esp_envs.spec import ActionSpace
 
 
 class ExploringHead(Head):
@@ -150,8 +150,3 @@ class BoundedPoint(ExploringHead, Bounded):
 SATURATED = 0.99  # length from which a bounded action counts as one at its bounds
 
 ActorHead = ExploringCategorical | BoundedPoint
-
-
-def build_actor_head(space: ActionSpace, num_seeds: int) -> ActorHead:
-    """Return the head of a deterministic or straight-through actor that fits an action space."""
-    return ExploringCategorical(space, num_seeds) if isinstance(space, Discrete) else BoundedPoint(space, num_seeds)

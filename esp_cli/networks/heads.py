@@ -26,7 +26,7 @@ from esp_cli.networks.policies import (
     Policies,
 )
 from esp_cli.symmetry.frame import Frame
-from esp_envs.spec import ActionSpace, Continuous, Discrete
+from esp_envs.spec import Continuous, Discrete
 
 _INITIAL_STD = 0.6
 MASKED = -1e9  # output of an action that is not allowed: its probability is exactly 0, and it is never the best
@@ -200,8 +200,3 @@ def squash(action: Tensor, disc: Tensor) -> Tensor:
     """Map unbounded actions [..., width] into the bounds, vectors along their length: u tanh|u| / |u|."""
     length = (action.square() @ disc + 1e-18).sqrt()
     return action * (torch.tanh(length) / length)
-
-
-def build_head(space: ActionSpace, num_seeds: int) -> Categorical | BoundedGaussian:
-    """Return the head of a stochastic policy that fits an action space."""
-    return Categorical(space) if isinstance(space, Discrete) else BoundedGaussian(space, num_seeds)

@@ -9,11 +9,11 @@ from torch import Tensor, nn
 
 from esp_cli.networks.build import build_network
 from esp_cli.networks.contract import Generators, IoSpec, Network, NetworkConfig, Reads, WithVJP
-from esp_cli.networks.heads import BoundedGaussian, Categorical, Head, build_head, masked
+from esp_cli.networks.heads import BoundedGaussian, Categorical, Head, masked
 from esp_cli.networks.kernels.library import begin
 from esp_cli.networks.plain import PlainConfig
 from esp_cli.networks.symmetrised import Separate, action_parts
-from esp_envs.spec import Spaces, TaskSpec
+from esp_envs.spec import Discrete, Spaces, TaskSpec
 
 POLICY_GAIN = 0.01  # orthogonal gain of the last layer: the first policy is nearly uniform (MAPPO paper's default)
 
@@ -89,7 +89,9 @@ class StochasticPolicy(Policy):
     head: Categorical | BoundedGaussian
 
     def __init__(self, spec: Spaces, network: NetworkConfig, generators: Generators) -> None:
-        super().__init__(spec, network, generators, build_head(spec.action, len(generators)), POLICY_GAIN)
+        space = spec.action
+        head = Categorical(space) if isinstance(space, Discrete) else BoundedGaussian(space, len(generators))
+        super().__init__(spec, network, generators, head, POLICY_GAIN)
 
     def unroll(self, obs: Tensor, truncation: int = 0, action_mask: Tensor | None = None) -> Tensor:
         """Return the normalised outputs [S, B, T, N, outputs] over whole episodes obs [S, B, T, N, D]."""

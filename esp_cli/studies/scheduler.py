@@ -46,20 +46,6 @@ class Run:
         return self.step * len(self.cell.config.seeds) / self.trained_s if self.trained_s > 0 and self.step else None
 
 
-@dataclass(frozen=True)
-class Snapshot:
-    """What a listener is told at every look."""
-
-    runs: Sequence[Run]  # all cells, in order
-    left_s: float | None  # seconds until all are trained, or None where nothing can be said yet
-
-    def count(self, *statuses: Status) -> int:
-        return sum(run.status in statuses for run in self.runs)
-
-
-Listener = Callable[[Snapshot], bool]  # told of progress; returns False to ask all processes to stop cleanly
-
-
 class Scheduler:
     """Runs the cells of a study or search side by side; the set of runs says what each of them does next."""
 
@@ -67,10 +53,14 @@ class Scheduler:
         self.folder, self.jobs, self.engine = folder, jobs, engine
         self.runs = [Run(cell, "finished" if folder.is_finished(cell) else "waiting") for cell in cells]
 
-    def run(self, listener: Listener, poll_s: float = POLL_S) -> bool:
+    def count(self, *statuses: Status) -> int:
+        return sum(run.status in statuses for run in self.runs)
+
+    def run(self, listener: Callable[[Scheduler], bool], poll_s: float = POLL_S) -> bool:
         """Run everything that is not finished; a run that fails is left as it is and the others go on.
 
-        The listener is told every `poll_s` seconds; where it asks to stop, False is returned.
+        The listener is handed this scheduler every `poll_s` seconds; where it returns False, all processes are asked
+        to stop cleanly and so does this.
         """
         going = True
         for run in self.runs:
@@ -82,7 +72,7 @@ class Scheduler:
                 if going:
                     self._fill()
                 active = [run for run in self.runs if run.is_active]
-                if not listener(Snapshot(self.runs, self.left_s())) and going:
+                if not listener(self) and going:
                     going = False
                     self._stop()
                 if not any(run.is_active for run in self.runs):

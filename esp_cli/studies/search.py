@@ -18,6 +18,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import optuna
@@ -63,7 +64,8 @@ class Search(RunSet):
         journal = path / JOURNAL
         mend_last_line(journal)
         try:
-            storage = optuna.storages.JournalStorage(JournalFileBackend(str(journal), lock_obj=_NoLock()))
+            backend = JournalFileBackend(str(journal), lock_obj=Lock())  # no file that a kill would leave behind
+            storage = optuna.storages.JournalStorage(backend)
             self.studies = {prior: self._study(storage, prior) for prior in tuning.priors}
         except Exception as error:  # whatever Optuna stumbles over
             raise self._damaged(shortened(str(error))) from None
@@ -254,13 +256,3 @@ def _is_sound(trial: Any, space: Mapping[str, BaseDistribution]) -> bool:
         and all(math.isfinite(value) for value in (*trial.intermediate_values.values(), *rungs, *values))
         and isinstance(trial.user_attrs.get(_REFUSED, ""), str)
     )
-
-
-class _NoLock:
-    """No lock: that of the search's folder is held, and no kill leaves a file behind."""
-
-    def acquire(self) -> bool:
-        return True
-
-    def release(self) -> None:
-        pass

@@ -17,7 +17,7 @@ from esp_cli.commands.studying import open_resources, run_cells
 from esp_cli.files.opening import holding
 from esp_cli.studies.engine import Job, LocalEngine
 from esp_cli.studies.kinds import KINDS
-from esp_cli.studies.scheduler import Scheduler, Snapshot
+from esp_cli.studies.scheduler import Scheduler
 from esp_cli.studies.study import StudyFolder
 from esp_cli.training import trainer
 from esp_cli.training.metrics import read_metrics
@@ -199,39 +199,41 @@ def test_a_study_is_reported_by_itself_and_held_by_one_process(tmp_path: Path, f
 
 def test_progress_in_a_pipe_says_what_changed_and_a_line_a_minute(tmp_path, capsys):
     folder = StudyFolder.create(tmp_path / "s", small_study())
-    plain, esp_run = runs = Scheduler(folder, folder.study.cells, 1, LocalEngine(stand_in())).runs
+    scheduler = Scheduler(folder, folder.study.cells, 1, LocalEngine(stand_in()))
+    plain, esp_run = scheduler.runs
     now = [0.0]
     with StudyProgress(clock=lambda: now[0]) as progress:
         plain.status = "training"
-        progress.update(Snapshot(runs, None))
+        progress.update(scheduler)
         plain.step, plain.trained_s = 100, 10.0
         now[0] = 30.0
-        progress.update(Snapshot(runs, 25.0))
+        progress.update(scheduler)
         now[0] = 61.0
-        progress.update(Snapshot(runs, 25.0))
+        progress.update(scheduler)
         plain.status, esp_run.status, esp_run.message = "finished", "failed", "no disk"
-        progress.update(Snapshot(runs, 0.0))
+        progress.update(scheduler)
     assert capsys.readouterr().err.splitlines() == [
         f"training {plain.cell.name}",
         f"  {plain.cell.name}  0/200",
         "0%  0/2 runs finished  ? left",
         f"  {plain.cell.name}  100/200  30 seed-steps/s  10 s left",
-        "25%  0/2 runs finished  25 s left",
+        "25%  0/2 runs finished  30 s left",
         f"finished {plain.cell.name} after 10 s",
         f"error: {esp_run.cell.name} failed: no disk; the others go on",
     ]
-    assert share(Snapshot(runs, 0.0)) == 0.5
-    assert "1 failed" in whole_status(Snapshot(runs, 0.0))
+    assert share(scheduler) == 0.5
+    assert "1 failed" in whole_status(scheduler)
 
 
 def test_progress_on_a_terminal_has_a_bar_for_each_running_process(tmp_path, monkeypatch):
     terminal = console.streams.SafeConsole(force_terminal=True, width=120, file=(tmp_path / "screen").open("w"))
     monkeypatch.setattr(console.progress, "err", terminal)
     folder = StudyFolder.create(tmp_path / "s", small_study())
-    runs = Scheduler(folder, folder.study.cells, 1, LocalEngine(stand_in())).runs
+    scheduler = Scheduler(folder, folder.study.cells, 1, LocalEngine(stand_in()))
+    runs = scheduler.runs
     runs[0].status, runs[0].step, runs[0].trained_s = "training", 100, 10.0
     with StudyProgress() as progress:
-        progress.update(Snapshot(runs, 25.0))
+        progress.update(scheduler)
     terminal.file.close()
     screen = (tmp_path / "screen").read_text()
     assert runs[0].cell.name in screen

@@ -33,7 +33,7 @@ from esp_cli.studies.engine_ray import (
     versions,
 )
 from esp_cli.studies.run_set import Cell
-from esp_cli.studies.scheduler import Scheduler, Snapshot
+from esp_cli.studies.scheduler import Scheduler
 from esp_cli.studies.study import Study, StudyFolder
 from esp_cli.training.metrics import read_metrics
 from esp_cli.training.run_folder import RunFolder, checkpoints_in, step_of
@@ -98,7 +98,7 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return found
 
 
-def scheduled(folder: StudyFolder, engine: RayEngine, listener: Callable[[Snapshot], bool], **choice) -> Scheduler:
+def scheduled(folder: StudyFolder, engine: RayEngine, listener: Callable[[Scheduler], bool], **choice) -> Scheduler:
     scheduler = Scheduler(folder, choice.get("cells", folder.study.cells), 2, engine)
     scheduler.complete = scheduler.run(listener, 0.05)
     return scheduler
@@ -128,7 +128,7 @@ def test_a_lost_node_and_a_lost_worker_cost_a_checkpoint_and_change_no_result(cl
     cell = folder.study.cells[1]
     lost: list[str] = []
 
-    def lose(snapshot: Snapshot) -> bool:
+    def lose(_: Scheduler) -> bool:
         if not lost and checkpointed(folder, cell):
             for node in list(cluster.nodes_of_work):
                 cluster.remove_node(node, allow_graceful=False)

@@ -168,17 +168,19 @@ class Dispersion(VmasTask):
         return torch.nn.functional.normalize(offset.take_along_dim(goal[..., None, None], 2).squeeze(2), dim=-1)
 
 
-def _vectors(*names: str) -> tuple[Field, ...]:
-    return tuple(Field(name, Kind.VECTOR, unit="length") for name in names)
+def _vector(name: str) -> Field:
+    return Field(name, Kind.VECTOR, unit="length")
 
 
-def _scenario(
-    name: str, symmetry: str, *seen: Field, agents: int, fixed: bool = False, **attributes: object
-) -> type[VmasTask]:
-    """Return the task of a scenario; where it is `fixed`, it takes no other number of agents."""
+def _scenario(name: str, *seen: str | Field, agents: int, fixed: bool = False, **attributes: object) -> type[VmasTask]:
+    """Return the task of a scenario without symmetry; where it is `fixed`, it takes no other number of agents.
+
+    An agent sees its position, its velocity and then what is `seen`; a name alone is that of a vector.
+    """
     settings = type("Settings", (VmasSettings,), {"__annotations__": {"num_agents": int}, "num_agents": agents})
-    members: dict[str, object] = {"Settings": settings, "scenario": name, "symmetry": symmetry, "terminates": True}
-    members |= {"convention": f"vmas {name}", "seen": lambda _: layout(*seen), "__module__": __name__}
+    whole = layout(*_OWN, *(_vector(one) if isinstance(one, str) else one for one in seen))
+    members: dict[str, object] = {"Settings": settings, "scenario": name, "symmetry": "c1", "terminates": True}
+    members |= {"convention": f"vmas {name}", "seen": lambda _: whole, "__module__": __name__}
     if fixed:
         members["arguments"] = lambda _: {}
     return type(name.title().replace("_", ""), (VmasTask,), members | attributes)
@@ -192,59 +194,46 @@ def _samples_around(_: VmasTask, obs: Tensor) -> Tensor:
 def _player(rival: str) -> Layout:
     """Return what a player of football sees, the other players as vectors from them."""
     body = tuple(Field(name, Kind.VECTOR) for name in ("offset", "relative_velocity", "velocity", "force"))
-    ball = _vectors("force", "from_ball", "ball_relative_velocity", "ball_from_goal", "ball_velocity", "ball_force")
+    ball = ("force", "from_ball", "ball_relative_velocity", "ball_from_goal", "ball_velocity", "ball_force")
     return layout(
-        *ball,
-        *_vectors("from_goal", "velocity"),
+        *map(_vector, (*ball, "from_goal", "velocity")),
         Field("rivals", Kind.RECORD, 3, parts=body, family=rival),
         Field("fellows", Kind.RECORD, 2, parts=body, items=Items.OTHERS),
     )
 
 
-_WHEEL = (
-    *_vectors("from_line", "end", "other_end"),
-    Field("level", Kind.SCALAR),
-    Field("slope", Kind.PSEUDOSCALAR),
-    Field("spin", Kind.SCALAR, 2),
-)
-BallPassage = _scenario(
-    "ball_passage", "c1", *_OWN, *_vectors("from_goal", "from_ball", "from_passage"), agents=2, fixed=True
-)
-BallTrajectory = _scenario("ball_trajectory", "c1", *_OWN, *_vectors("from_ball", "again"), agents=2, fixed=True)
-BuzzWire = _scenario("buzz_wire", "c1", *_OWN, *_vectors("from_goal"), agents=2, fixed=True)
-Discovery = _scenario("discovery", "c1", *_OWN, Field("lidar", Kind.RING, rays=15), agents=5)
-Dropout = _scenario("dropout", "c1", *_OWN, *_vectors("goal"), Field("done", Kind.SCALAR), agents=4, flags=("eaten",))
+def _lidar(rays: int, name: str = "lidar") -> Field:
+    return Field(name, Kind.RING, rays=rays)
+
+
+BallPassage = _scenario("ball_passage", "from_goal", "from_ball", "from_passage", agents=2, fixed=True)
+BallTrajectory = _scenario("ball_trajectory", "from_ball", "again", agents=2, fixed=True)
+BuzzWire = _scenario("buzz_wire", "from_goal", agents=2, fixed=True)
+Discovery = _scenario("discovery", _lidar(15), agents=5)
+Dropout = _scenario("dropout", "goal", Field("done", Kind.SCALAR), agents=4, flags=("eaten",))
 Football = _scenario(
     "football",
-    "c1",
     agents=6,
     arguments=lambda _: {"ai_red_agents": False},
     seen=lambda _: {"agent_blue": _player("agent_red"), "agent_red": _player("agent_blue")},
 )
-Flocking = _scenario("flocking", "c1", *_OWN, *_vectors("from_target"), Field("lidar", Kind.RING, rays=12), agents=4)
-GiveWay = _scenario("give_way", "c1", *_OWN, agents=2, fixed=True, own_goals="goal")
-JointPassage = _scenario(
-    "joint_passage", "c1", *_OWN, *_vectors("from_goal", "from_passage", "goal_direction"), agents=2, fixed=True
-)
+Flocking = _scenario("flocking", "from_target", _lidar(12), agents=4)
+GiveWay = _scenario("give_way", agents=2, fixed=True, own_goals="goal")
+JointPassage = _scenario("joint_passage", "from_goal", "from_passage", "goal_direction", agents=2, fixed=True)
 JointPassageSize = _scenario(
-    "joint_passage_size",
-    "c1",
-    *_OWN,
-    *_vectors("from_goal", "from_big", "from_small", "goal_direction"),
-    agents=2,
-    fixed=True,
+    "joint_passage_size", "from_goal", "from_big", "from_small", "goal_direction", agents=2, fixed=True
 )
 MultiGiveWay = _scenario(
-    "multi_give_way", "c1", *_OWN, *_vectors("from_goal"), Field("distance", Kind.SCALAR), agents=4, fixed=True,
-    own_goals="goal",
-)  # fmt: skip
-Passage = _scenario("passage", "c1", *_OWN, *_vectors("goal", "passage"), agents=5, fixed=True, own_goals="goal")
-ReverseTransport = _scenario(
-    "reverse_transport", "c1", *_OWN, *_vectors("package_velocity", "package", "package_from_goal"), agents=4
+    "multi_give_way", "from_goal", Field("distance", Kind.SCALAR), agents=4, fixed=True, own_goals="goal"
 )
-Sampling = _scenario(
-    "sampling", "c1", *_OWN, *(Field(name, Kind.RING, rays=rays) for name, rays in (("lidar", 12), ("samples", 8))),
-    agents=3, reading=_samples_around,
-)  # fmt: skip
-Wheel = _scenario("wheel", "c1", *_OWN, *_WHEEL, agents=4, reading=_with_direction(10))
-WindFlocking = _scenario("wind_flocking", "c1", *_OWN, agents=2, fixed=True)
+Passage = _scenario("passage", "goal", "passage", agents=5, fixed=True, own_goals="goal")
+ReverseTransport = _scenario("reverse_transport", "package_velocity", "package", "package_from_goal", agents=4)
+Sampling = _scenario("sampling", _lidar(12), _lidar(8, "samples"), agents=3, reading=_samples_around)
+Wheel = _scenario(
+    "wheel",
+    *("from_line", "end", "other_end"),
+    *(Field("level", Kind.SCALAR), Field("slope", Kind.PSEUDOSCALAR), Field("spin", Kind.SCALAR, 2)),
+    agents=4,
+    reading=_with_direction(10),
+)
+WindFlocking = _scenario("wind_flocking", agents=2, fixed=True)

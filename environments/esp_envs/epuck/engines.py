@@ -5,7 +5,6 @@ from __future__ import annotations
 from esp_envs.epuck.gl import forget_missing_backend
 from esp_envs.epuck.physics import Physics
 from esp_envs.epuck.robot import Arena
-from esp_envs.errors import UserError
 from esp_envs.installed import load
 
 ENGINES = {
@@ -16,11 +15,7 @@ ENGINES = {
 
 
 def make_physics(name: str, arena: Arena, num_worlds: int, control_period_s: float) -> Physics:
-    """Make W worlds in the engine `name`; refuse one whose library is missing."""
+    """Make W worlds in the engine `name`."""
     forget_missing_backend()
-    try:
-        engine: type[Physics] = load(ENGINES[name])
-    except ImportError as error:
-        package = (error.name or name.partition("-")[0]).partition(".")[0]
-        raise UserError(f"the physics '{name}' needs the package {package}; pip install --upgrade {package}") from None
+    engine: type[Physics] = load(ENGINES[name])
     return engine(arena, num_worlds, control_period_s)

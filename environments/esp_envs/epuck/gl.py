@@ -55,10 +55,8 @@ def forget_missing_backend() -> None:
 def open_painter(size: int) -> Iterator[Painter]:
     """Open a painter of scenes in space, `size` pixels wide, 16 or more; MuJoCo is imported when it is opened."""
     forget_missing_backend()
-    try:
-        from esp_envs.epuck.view import SpacePainter  # noqa: PLC0415
-    except ImportError as error:
-        raise NoGraphicsError(f"a view in space needs the package {error.name}; pip install {error.name}") from None
+    from esp_envs.epuck.view import SpacePainter  # noqa: PLC0415 - imports MuJoCo
+
     painter = SpacePainter(size)
     choose_library()
     try:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 from itertools import accumulate, pairwise
 from math import prod
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -219,3 +219,29 @@ class LearningPass(CompiledPass):
         found = self._room(self.outputs)
         call(kernel, function, self._arguments, *of_loss, found)
         return found
+
+
+class _Regression(ctypes.Structure):
+    _fields_ = (
+        *fields(ctypes.c_int64, "learned"),
+        *fields(ctypes.c_float, "delta", "weight", "gap_weight"),
+        ("target", ctypes.c_void_p),
+    )
+
+
+class Regression(NamedTuple):
+    """Huber losses of values of the first parts of rows, and squared gaps between each copy and the original.
+
+    `algorithms.objectives.value_loss` is the same in torch.
+    """
+
+    target: Tensor  # [S, 1, R]
+    learned: int  # L
+    delta: float
+    weight: float
+    gap_weight: float = 0.0
+
+    def learn(self, run: LearningPass) -> Tensor:
+        """Return the gradients [S, P] by the parameters of a perceptron whose only output are the values."""
+        target, numbers = self.target.contiguous(), (self.delta, self.weight, self.gap_weight)
+        return run.learn("perceptron", "learn_values", _Regression(self.learned, *numbers, target.data_ptr()))

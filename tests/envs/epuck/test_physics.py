@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from esp_envs.epuck.engines import ENGINES, make_physics
+from esp_envs.epuck.engines import ENGINES
 from esp_envs.epuck.robot import MAX_SPEED_M_S, Arena, Array
 from tests.envs.epuck.driving import PERIOD_S, engine
 
@@ -136,17 +136,6 @@ def test_what_is_read_is_memory_of_its_own(name: str) -> None:
         array[...] = 9.0
     np.testing.assert_allclose(physics.pose, [[[0.1, 0.2, 0.3]]], atol=1e-15)
     assert np.abs(physics.velocity).max() == 0
-
-
-@every_engine
-def test_a_missing_library_is_named(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    library = name.partition("-")[0]
-    for module in list(sys.modules):
-        if module.startswith(("esp_envs.epuck.mujoco", "esp_envs.epuck.pymunk", f"{library}.")):
-            monkeypatch.delitem(sys.modules, module)
-    monkeypatch.setitem(sys.modules, library, None)
-    with pytest.raises(ValueError, match=f"needs the package {library}; pip install --upgrade {library}$"):
-        make_physics(name, OPEN, 1, PERIOD_S)
 
 
 def test_the_engines_are_imported_when_they_are_asked_for() -> None:
