@@ -42,6 +42,7 @@ _SMALL = 0.01
 """Share of a field's spread below which a number's own spread, or that of its changes, is what counts: else a large
 number would hide a small one beside it, and a large world slow steps."""
 _OF_GINI = math.pi**0.5 / 2  # standard deviations of normal chance in one of its mean difference
+_PAIRS = 4096  # of numbers, whose covariances are compared, at most: of more those that stand close together
 _ULPS = 1e-6  # rounding of a number as a share of it, at least
 Outcomes = dict[str, Tensor]  # what a step gives, by field: [M, numbers]
 
@@ -58,16 +59,13 @@ def state_by_state(
     own, *others, image = (side.isfinite().all(1) for side in (x, x2, close, y))
     if share := float((torch.stack(others) == own).all(0).logical_and(image != own).float().mean()):
         return FieldVerdict(name, "broken", share, 0.0, share=share)  # numbers on one side alone
-    before = first.get(f"start {name}", x)
-    before = before if len(before) == len(x) else x  # some simulators of others do not say what is seen at the start
     (x, x2, y), known = _known(x, x2, y)
     if not len(x):
         return FieldVerdict(name, "not covered", float("nan"), float("nan"))
-    scale = _scale(x, y)
+    units, scale = _units(name, first, alike, known)
     rounding = torch.maximum((x - close[known]).abs().amax(1).nan_to_num(), _ULPS * x.abs().amax(1))
-    units = _units(x, x - before[known], scale)
     found = _each_state(name, (x - y).abs(), _ROUNDINGS * rounding, scale, units)
-    is_certain = float((x - x2).abs().max()) <= NEGLIGIBLE * scale
+    is_certain = bool(((x - x2).abs() <= NEGLIGIBLE * units).all())
     return found if is_certain or found.outcome == "holds" else None
 
 
@@ -88,26 +86,48 @@ def beside_what_is_seen(name: str, sides: Sequence[Outcomes], near: Outcomes) ->
     return FieldVerdict(name, "broken", share, error, share=share) if share > max(SIGNIFICANT * error, FEW) else None
 
 
-def by_distances(name: str, x: Tensor, x2: Tensor, y: Tensor, y2: Tensor) -> FieldVerdict:
-    """Judge one field with chance from four runs [M, numbers]: x and x2 transformed, y and y2 from images."""
-    (x, x2, y, y2), _ = _known(x, x2, y, y2)
-    if not len(x):
+def by_distances(
+    name: str, sides: Sequence[Outcomes], together: Sequence[str] = (), worlds: Tensor | None = None
+) -> FieldVerdict:
+    """Judge one field with chance, or some together, from four runs: two that are transformed and two from images.
+
+    Rows are independent, or else those of each of the `worlds`, [M] numbers from 0, count once.
+    """
+    fields = together or [name]
+    rows, known = _known(*(torch.cat([side[field] for field in fields], 1) for side in sides))
+    if not len(rows[0]):
         return FieldVerdict(name, "not covered", float("nan"), float("nan"))
-    scale = _scale(x, y)
+    each = [_units(field, sides[0], sides[2], known)[0] for field in fields]
+    units, shares = torch.cat(each), torch.cat([torch.full_like(unit, len(unit) ** -0.5) for unit in each])
+    x, x2, y, y2 = (side / units for side in rows)
     within, across = ((x - x2, y - y2), (x - y, x2 - y2, x - y2, x2 - y))
-    # The second distance is bounded, so that rare large chance (a touch, a capture) hides no small constant fault.
-    bound = _BOUND * scale
-    distances = (Tensor.abs, lambda gap: bound * -torch.expm1(-gap.abs() / bound))
-    tests = [_excess(distance, within, across) for distance in distances]
-    tests.append((x + x2 - y - y2) / 2)
-    tests.append(((x - x2).abs() - (y - y2).abs()) * _OF_GINI)
-    samples = torch.cat(tests, 1).double() / scale
+    # of all numbers at once, since chance may tie them together
+    tests = [_excess(lambda gap: (gap * shares).norm(dim=1, keepdim=True), within, across)]
+    if not together:
+        # The second distance is bounded, so that rare large chance (a touch, a capture) hides no small constant fault.
+        distances = (Tensor.abs, lambda gap: _BOUND * -torch.expm1(-gap.abs() / _BOUND))
+        tests += [_excess(distance, within, across) for distance in distances]
+        tests.append((x + x2 - y - y2) / 2)
+        tests.append(((x - x2).abs() - (y - y2).abs()) * _OF_GINI)
+    count = sum(test.shape[1] for test in tests)
+    most = min(x.shape[1] // 2, max(1, _PAIRS // x.shape[1]))
+    tests += [_covariance(within[0], k) - _covariance(within[1], k) for k in range(1, most + 1)]
+    samples = torch.cat(tests, 1).double()
+    if worlds is not None:
+        _, worlds, counts = worlds[known].unique(return_inverse=True, return_counts=True)
+        sums = samples.new_zeros(len(counts), samples.shape[1]).index_add_(0, worlds, samples)
+        samples = sums * len(counts) / counts.sum()
     gaps, errors = samples.mean(0).abs(), samples.std(0) / len(samples) ** 0.5
     broken = (gaps > SIGNIFICANT * errors) & (gaps > NEGLIGIBLE)
     worst = int(torch.where(broken, gaps, gaps * (not broken.any())).argmax())
     gap, error = float(gaps[worst]), float(errors[worst])
-    chances = torch.special.ndtr((gaps - TOLERATED) / errors.clamp_min(1e-12))
+    chances = torch.special.ndtr((gaps - TOLERATED) / errors.clamp_min(1e-12))[:count]
     return concluded(name, gap, error, bool(broken.any()), float(chances.max()))
+
+
+def _covariance(gap: Tensor, places: int) -> Tensor:
+    """Return what two runs [M, numbers] that differ by `gap` say of covariances with numbers so many places before."""
+    return gap * gap.roll(places, 1) / 2
 
 
 def _known(*sides: Tensor) -> tuple[list[Tensor], Tensor]:
@@ -116,14 +136,15 @@ def _known(*sides: Tensor) -> tuple[list[Tensor], Tensor]:
     return [side[known] for side in sides], known
 
 
-def _scale(x: Tensor, y: Tensor) -> float:
-    return max(float(torch.cat([x, y]).std(0).max()), 1e-6)
-
-
-def _units(x: Tensor, change: Tensor, scale: float) -> Tensor:
-    """Return in which unit each number of a field [M, numbers] is compared: of its spread `scale`, or a smaller one."""
+def _units(name: str, first: Outcomes, image: Outcomes, known: Tensor) -> tuple[Tensor, float]:
+    """Return in which unit each number of a field is compared, and the field's spread: the unit, or a larger one."""
+    x, y = first[name][known], image[name][known]
+    scale = max(float(torch.cat([x, y]).std(0).max()), 1e-6)
+    before = first.get(f"start {name}", first[name])
+    # some simulators of others do not say what is seen at the start
+    change = x - before[known] if len(before) == len(known) else torch.zeros_like(x)
     own = torch.where(change.any(0), torch.minimum(x.std(0), change.nan_to_num().std(0)), x.std(0))
-    return torch.where(own < _SMALL * scale, own.clamp_min(NEGLIGIBLE * scale), scale).clamp_min(1e-6)
+    return torch.where(own < _SMALL * scale, own.clamp_min(NEGLIGIBLE * scale), scale).clamp_min(1e-6), scale
 
 
 def _each_state(name: str, apart: Tensor, rounding: Tensor, scale: float, units: Tensor) -> FieldVerdict:

@@ -23,7 +23,7 @@ from esp_cli.checking.comparison import (
     state_by_state,
 )
 from esp_cli.checking.shifting import Shift, Unmoved
-from esp_cli.checking.stepping import nudged, outcomes, seek_end, stretched, visit
+from esp_cli.checking.stepping import nudged, outcomes, played, seek_end, stretched, visit
 from esp_cli.checking.verdicts import ElementVerdict, FieldVerdict, Late, Watch, may_come, verdicts_of
 from esp_cli.symmetry import Element, Transform, build_transform
 from esp_envs.promises import MakeWorlds
@@ -31,8 +31,10 @@ from esp_envs.spec import TaskSpec
 
 _FEWEST_WORLDS, _MOST_WORLDS = 64, 256
 _NUMBERS = 1 << 18  # that all worlds together may show their agents at once; with pictures they are fewer
-_SOME = 8  # of more elements than these, each is first tried in one of so many states
+_SOME, _THESE = 8, 4
+"""Of more elements than `_SOME`, each is first tried in one of so many states; later steps are those of `_THESE`."""
 _FURTHER = "holds where play went, but further out {} would differ"
+_TOGETHER = "fields together"
 _HIDDEN = "the state leaves out {}, and later steps do not tell what that does"
 _LATER, _LATER_OF_SLOW = 128, 32
 """Steps that are followed from an episode's start, for what builds up that no state holds, or until an end is found;
@@ -75,13 +77,13 @@ class _Judge:
         self, make: MakeWorlds, spec: TaskSpec, moments: Sequence[Visited], slow: bool, until: float, quick: bool
     ) -> None:
         self._make, self._spec, self._moments, self._until, self._quick = make, spec, moments, until, quick
-        self._later = _LATER_OF_SLOW if slow else _LATER
+        self._later, self._few = (_LATER_OF_SLOW, FEW) if slow else (_LATER, 0.0)
         states, actions = (torch.cat(part, 1) for part in zip(*moments, strict=True))
         self._visited = moments if slow else [(states, actions)]
         self._some = [(state[:, ::_SOME], action[:, ::_SOME]) for state, action in self._visited]
 
     def __call__(self, element: Element | Shift) -> ElementVerdict:
-        if self._quick and (found := self._few.judge(element)).outcome == "broken":
+        if self._quick and (found := self._fewer.judge(element)).outcome == "broken":
             return found
         found = self._everywhere.judge(element)
         if found.outcome == "not covered" and [f.field for f in found.fields if f.outcome != "holds"] == ["end"]:
@@ -95,7 +97,7 @@ class _Judge:
         return _Pairs(self._make, self._visited, self._until)
 
     @cached_property
-    def _few(self) -> _Pairs:
+    def _fewer(self) -> _Pairs:
         return _Pairs(self._make, self._some, self._until)
 
     @cached_property
@@ -108,13 +110,15 @@ class _Judge:
 
     @cached_property
     def _onwards(self) -> _Pairs | None:
-        spec = self._spec
-        if spec.terminates or spec.masks or spec.agents_end:  # nobody knows what may be done later, or for how long
-            return None
-        actions = [action[:, ::_SOME] for _, action in self._moments]
-        start = self._moments[0][0][:, ::_SOME]
-        episode = [(start, actions[k % len(actions)]) for k in range(min(self._later, spec.horizon))]
-        return self._tried(lambda: episode, onwards=True)
+        steps, start = min(self._later, self._spec.horizon), self._moments[0][0][:, ::_THESE]
+        actions = [action[:, ::_THESE] for _, action in self._moments]
+
+        def episode() -> Sequence[Visited]:
+            if self._spec.masks:  # what is allowed later depends on what was done
+                return played(self._make, start, steps, _HERE[0], self._until)
+            return [(start, actions[k % len(actions)]) for k in range(steps)]
+
+        return self._tried(episode, onwards=True)
 
     def _tried(self, moments: Callable[[], Sequence[Visited]], onwards: bool = False) -> _Pairs | None:
         """Return pairs from states, or None where these, or what is done in them, are not for this task."""
@@ -131,7 +135,7 @@ class _Judge:
     def _as_further_out(self, element: Element | Shift, found: ElementVerdict) -> ElementVerdict:
         assert self._further is not None
         beyond = self._further.judge(element)
-        broken = (f for f in beyond.fields if f.outcome == "broken" and not f.share <= FEW)  # a share may be NaN
+        broken = (f for f in beyond.fields if f.outcome == "broken" and not f.share <= self._few)  # a share may be NaN
         fields = tuple(replace(f, outcome="not covered") for f in broken)
         if not fields:
             return found
@@ -178,9 +182,12 @@ class _Pairs:
                 self._unseen(name, first, alike)
                 or state_by_state(name, first, second, alike, near)
                 or beside_what_is_seen(name, (first, second, *apart()), near)
-                or by_distances(name, first[name], second[name], *(side[name] for side in apart()))
+                or by_distances(name, (first, second, *apart()))
                 for name in first
             ]
+            if all(v.outcome == "holds" for v in verdicts) and any(math.isnan(v.share) for v in verdicts):
+                drawn = [name for name in first if not torch.equal(first[name], second[name])]
+                verdicts.append(by_distances(_TOGETHER, (first, second, *apart()), drawn))
         except (Exception, SystemExit) as error:
             reason = f"the task raises in the transformed states: {type(error).__name__}: {error}"
             return ElementVerdict(element.name, declared, (), reason)
@@ -197,19 +204,43 @@ class _Pairs:
             alike = self._there(transform, 0, _HERE[0])
         except (Exception, SystemExit):
             return None
-        sides, rows = (first, second, alike, near), self._visited[0][0].shape[1] * _LATER_OF_SLOW
+        sides, worlds = (first, second, alike, near), self._visited[0][0].shape[1]
+        goes = _until_an_end(sides, worlds)
         # in either half of the worlds: an event that rounding tips in one of them is no breaking
-        halves = [[{name: row[:rows][k::2] for name, row in side.items()} for side in sides] for k in (0, 1)]
-        verdicts = {name: [state_by_state(name, *half) for half in halves] for name in first}
-        verdicts |= {f"{name} later": [state_by_state(name, *sides)] for name in first}
+        soon = goes.clone()
+        soon[worlds * _LATER_OF_SLOW :] = False
+        halves = [soon & (torch.arange(len(goes), device=goes.device) % 2 == k) for k in (0, 1)]
+        names = [name for name in first if len(first[name]) == len(goes)]
+
+        def judged(name: str, rows: Tensor) -> FieldVerdict | None:
+            return state_by_state(name, *({one: side[one][rows] for one in names} for side in sides))
+
+        verdicts = {name: [judged(name, rows) for rows in halves] for name in names}
+        verdicts |= {f"{name} later": [judged(name, goes)] for name in names}
+        if drawn := [name for name in names if None in verdicts[name]]:
+            verdicts |= self._drawn_later(drawn, transform, first, second)
         least = 0.5 / min(len(self._visited), _LATER_OF_SLOW)
         broken = [
             told[0]
             for name, told in verdicts.items()
             if all(v and v.outcome == "broken" and not v.share <= (least if name in first else _LONG) for v in told)
         ]
-        holds = all(v and v.outcome == "holds" for name in first for v in verdicts[name])
+        holds = all(v and v.outcome == "holds" for name in names for v in verdicts[name])
         return tuple(merged([v for v in broken if v])) if broken or holds else None
+
+    def _drawn_later(
+        self, names: Sequence[str], transform: Transform | Unmoved, first: Outcomes, second: Outcomes
+    ) -> dict[str, list[FieldVerdict | None]]:
+        """Judge fields that chance decides in all steps, of which those of a world count once."""
+        try:
+            sides = (first, second, *(self._there(transform, twin, seed) for twin, seed in enumerate(_THERE)))
+        except (Exception, SystemExit):
+            return {}
+        worlds = self._visited[0][0].shape[1]
+        goes = _until_an_end(sides, worlds)
+        rows = [{name: side[name][goes] for name in side if len(side[name]) == len(goes)} for side in sides]
+        world = torch.arange(len(goes), device=goes.device)[goes] % worlds
+        return {name: [by_distances(name, rows, worlds=world)] for name in names}
 
     def _transform(self, element: Element | Shift) -> Transform | Unmoved:
         return element if isinstance(element, Shift) else build_transform([element], self._spec)
@@ -229,3 +260,9 @@ class _Pairs:
         ends = bool(first["end"].any()) and not bool(first["end"].all())
         unseen = may_come(name, ends, bool(rows.any())) and (name != "end" or self._spec.terminates)
         return FieldVerdict(name, "not covered", 0.0, 0.0) if unseen else None
+
+
+def _until_an_end(sides: Sequence[Outcomes], worlds: int) -> Tensor:
+    """Return which rows [steps x worlds] belong to the first episode of a world on all sides."""
+    ended = torch.stack([side["end"].any(1) for side in sides]).any(0).view(-1, worlds)
+    return (ended.cumsum(0) == ended).flatten()

@@ -139,6 +139,20 @@ def seek_end(make: MakeWorlds, state: Tensor, steps: int, until: float) -> tuple
     raise LookupError
 
 
+def played(make: MakeWorlds, state: Tensor, steps: int, seed: int, until: float) -> list[tuple[Tensor, Tensor]]:
+    """Return states [1, E, state width] and random actions that are allowed in the steps that follow them."""
+    env = make(state.shape[1], [0])
+    env.renews, episode = False, list[tuple[Tensor, Tensor]]()
+    _seed(env, seed)
+    env.reset()
+    env.set_state(state)
+    for _ in range(steps):
+        stop_at(until)
+        episode.append((state, env.random_action()))
+        env.step(episode[-1][1])
+    return episode
+
+
 def stretched(state: Tensor, layout: Layout, decades: float = 1.0) -> Tensor:
     """Return states [1, E, state width] whose vectors are up to 10**decades times as long, all of one alike."""
     share = torch.rand(state.shape[1], 1, generator=torch.Generator().manual_seed(0)).to(state.device)

@@ -226,14 +226,18 @@ def test_what_no_state_holds_is_judged_by_rows_only_where_nobody_else_is_there(c
     assert (found.outcome, bool(found.reason)) == (outcome, outcome == "not covered")
 
 
+def sides(*rows):
+    return [{"wind": one} for one in rows]
+
+
 def test_chance_of_another_spread_is_broken_by_the_difference_of_deviations():
     """Of +-1 the mean difference is 1, of +-2 it is 2; over the field's deviation, sqrt(5 / 2), times sqrt(pi) / 2."""
     g = torch.Generator().manual_seed(0)
     x, x2, y, y2 = (torch.randint(2, (4096, 1), generator=g) * 2.0 - 1 for _ in range(4))
-    found = by_distances("wind", x, x2, 2 * y, 2 * y2)
+    found = by_distances("wind", sides(x, x2, 2 * y, 2 * y2))
     assert found.outcome == "broken"
     assert found.gap == pytest.approx((math.pi / 4 / 2.5) ** 0.5, abs=0.03)
     normal = [torch.randn(4096, 1, generator=g) for _ in range(4)]
-    assert by_distances("wind", *normal).outcome == "holds"
+    assert by_distances("wind", sides(*normal)).outcome == "holds"
     first, second, *others = normal
-    assert by_distances("wind", first, second, *(1.3 * other for other in others)).outcome == "broken"
+    assert by_distances("wind", sides(first, second, *(1.3 * other for other in others))).outcome == "broken"

@@ -128,6 +128,47 @@ class Seldom(Point):  # nearly all reward is in one step of five hundred
         return torch.where(near, 100.0, 0.1 * super().paid(place))
 
 
+class Windy(Point):  # a wind that nobody sees from the tenth step on, along x
+    def moved(self, world, action):
+        return self.speed * action + 0.3 * (self._time > 10) * torch.tensor([1.0, 0.0])
+
+
+class WindyToAnEnd(Windy):
+    ends = True
+
+    def _ended(self, world):
+        return world["position"][:, :, 0].norm(dim=-1) < 0.1
+
+
+class WindyByChance(Windy):
+    def moved(self, world, action):
+        return super().moved(world, action) + 0.1 * self.draw(1, 2)
+
+
+class Street(Point):  # where gusts blow along one diagonal
+    def moved(self, world, action):
+        gust = self.draw(1, 1)
+        return 0.1 * action + 0.1 * torch.cat([gust, gust], -1)
+
+
+class PaidByGust(Point):  # for the gust that it was moved by, up; each number by itself may have either sign
+    def moved(self, world, action):
+        self.gust = self.draw(1, 2)
+        return 0.1 * action + 0.1 * self.gust
+
+    def paid(self, place):
+        return self.gust[:, :, 0, 1]
+
+
+class Meadow(Point):  # in a field of 100 m, with small gusts
+    size = 50.0
+
+    def moved(self, world, action):
+        return 0.1 * action + 0.01 * torch.stack(
+            [torch.randn(self.num_envs, 1, 2, generator=g) for g in self.generators]
+        )
+
+
 def verdict(task, element, from_transitions=False):
     report = check_symmetry(lambda n, seeds: task(Settings(), n, generators_for(seeds)), element, from_transitions)
     (found,) = report.elements
@@ -142,17 +183,25 @@ def test_a_breaking_is_found_that_builds_up_later_or_is_small_beside_other_numbe
     assert (outcome, field in fields) == ("broken", True)
 
 
-@pytest.mark.parametrize("task", [Point, Paid, Slow, Beside, Delayed, End])
-def test_mirrors_that_are_left_hold(task):
-    mirror = {Point: "rot90"}.get(task, "flip-x")
+@pytest.mark.parametrize(
+    ("task", "element", "mirror", "field"),
+    [
+        (WindyToAnEnd, "rot90", "flip-x", "obs.position"),
+        (WindyByChance, "rot90", "flip-x", "obs.position"),
+        (Street, "flip-x", "flip-diagonal", "obs.position"),
+        (PaidByGust, "flip-x", "flip-y", "fields together"),
+    ],
+)
+def test_breakings_by_chance_or_before_an_end_are_found(task, element, mirror, field):
+    outcome, fields = verdict(task, element)
+    assert (outcome, field in fields) == ("broken", True)
     assert verdict(task, mirror)[0] == "holds"
 
 
-class Alone(Delayed):  # of whose later steps nobody knows how they go on
-    ends = True
-
-    def _ended(self, world):
-        return world["position"][:, :, 0].norm(dim=-1) > 1
+@pytest.mark.parametrize("task", [Point, Paid, Slow, Beside, Delayed, End, Meadow])
+def test_mirrors_that_are_left_hold(task):
+    mirror = {Point: "rot90"}.get(task, "flip-x")
+    assert verdict(task, mirror)[0] == "holds"
 
 
 class Raising(Point):  # that stands still on the right, and raises where the second step finds it on the left
@@ -165,8 +214,12 @@ class Raising(Point):  # that stands still on the right, and raises where the se
         return 0 * action
 
 
+class Lost(Raising):
+    hides = ("what was done",)
+
+
 def test_what_the_state_leaves_out_is_not_covered_where_no_later_step_tells():
-    assert verdict(Alone, "flip-x") == ("not covered", set())
+    assert verdict(Lost, "flip-y") == ("not covered", set())
 
 
 def test_a_task_that_raises_in_steps_that_follow_images_is_judged_by_the_others():

@@ -1,8 +1,8 @@
-// The passes of perceptron.py, and the loss of values.py.
+// The passes of perceptron.py, and its loss of values.
 
 #include "perceptron.h"
 
-// What values.py fills in: Huber losses of the first parts of rows [R, P], and squared gaps between each copy and the
+// What perceptron.py fills in: Huber losses of the first parts of rows [R, P], and squared gaps between each copy and the
 // original.
 struct Regression {
     int64_t learned;
