@@ -42,7 +42,6 @@ _SMALL = 0.01
 """Share of a field's spread below which a number's own spread, or that of its changes, is what counts: else a large
 number would hide a small one beside it, and a large world slow steps."""
 _OF_GINI = math.pi**0.5 / 2  # standard deviations of normal chance in one of its mean difference
-_PAIRS = 4096  # of numbers, whose covariances are compared, at most: of more those that stand close together
 _ULPS = 1e-6  # rounding of a number as a share of it, at least
 Outcomes = dict[str, Tensor]  # what a step gives, by field: [M, numbers]
 
@@ -109,25 +108,29 @@ def by_distances(
         tests += [_excess(distance, within, across) for distance in distances]
         tests.append((x + x2 - y - y2) / 2)
         tests.append(((x - x2).abs() - (y - y2).abs()) * _OF_GINI)
-    count = sum(test.shape[1] for test in tests)
-    most = min(x.shape[1] // 2, max(1, _PAIRS // x.shape[1]))
-    tests += [_covariance(within[0], k) - _covariance(within[1], k) for k in range(1, most + 1)]
     samples = torch.cat(tests, 1).double()
     if worlds is not None:
         _, worlds, counts = worlds[known].unique(return_inverse=True, return_counts=True)
         sums = samples.new_zeros(len(counts), samples.shape[1]).index_add_(0, worlds, samples)
         samples = sums * len(counts) / counts.sum()
     gaps, errors = samples.mean(0).abs(), samples.std(0) / len(samples) ** 0.5
+    chances = torch.special.ndtr((gaps - TOLERATED) / errors.clamp_min(1e-12))
+    if worlds is None:
+        of_pairs = _covariances(*within)
+        gaps, errors = torch.cat([gaps, of_pairs[0]]), torch.cat([errors, of_pairs[1]])
     broken = (gaps > SIGNIFICANT * errors) & (gaps > NEGLIGIBLE)
-    worst = int(torch.where(broken, gaps, gaps * (not broken.any())).argmax())
+    worst = int(torch.where(broken, gaps, gaps * (not broken.any()))[: None if broken.any() else len(chances)].argmax())
     gap, error = float(gaps[worst]), float(errors[worst])
-    chances = torch.special.ndtr((gaps - TOLERATED) / errors.clamp_min(1e-12))[:count]
     return concluded(name, gap, error, bool(broken.any()), float(chances.max()))
 
 
-def _covariance(gap: Tensor, places: int) -> Tensor:
-    """Return what two runs [M, numbers] that differ by `gap` say of covariances with numbers so many places before."""
-    return gap * gap.roll(places, 1) / 2
+def _covariances(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Return by how much covariances differ, and standard errors, from differences of two runs on each side [M, D]."""
+    count, both = len(x), x * y
+    gap = (x.mT @ x - y.mT @ y) / (2 * count)
+    square = (x.square().mT @ x.square() - 2 * both.mT @ both + y.square().mT @ y.square()) / (4 * count)
+    error = ((square - gap.square()).clamp_min(0) / count).sqrt()
+    return gap.abs().flatten().double(), error.flatten().double()
 
 
 def _known(*sides: Tensor) -> tuple[list[Tensor], Tensor]:

@@ -4,8 +4,8 @@ A predictor of change and reward is fitted to each half of the episodes. On the 
 the images of these under an element by e(gx, gy). If starts, policy, dynamics and reward are symmetric, a transition
 and its image have one distribution, so any predictor errs on both alike. The gap squared is the difference
 (e(gx, gy) - e(x, y)) / variance; of an exact predictor it is the mean squared difference of a step from the image and
-the step's image. Squares of what changes are predicted too, which shows where noise is not symmetric; of the reward
-only the mean matters.
+the step's image. Squares of what changes, and products of neighbours in a field, are predicted too, which shows where
+noise is not symmetric; of the reward only the mean matters.
 
 A predictor that knows nothing errs alike everywhere. So breakings of the tolerance's size are planted in the same data
 (see `controls`): d h(x) is added to a field, for functions h that the element changes. An element holds where each of
@@ -57,7 +57,8 @@ def check_transitions(
 
     Each episode counts once. `watch` is told of how many elements of how many are judged; `until` as in `verdicts_of`.
     """
-    data = data.map(lambda x: x.float() if x.is_floating_point() else x)
+    data = data.map(_plain)
+    data = replace(data, reward=data.reward.float())
     _refuse_what_says_nothing(spaces, data)
     usual = _without_tails(data.reward)
     is_little = usual is not data.reward and bool(usual.var() < (1 - _CARRIES) * data.reward.var())
@@ -79,6 +80,13 @@ def check_transitions(
     return verdicts_of(elements, judge, lambda element: is_declared(element, spaces), watch, until)
 
 
+def _plain(x: Tensor) -> Tensor:
+    """Return numbers as float32 or int64, and flags as they are, without a graph."""
+    return (
+        x.detach() if x.dtype == torch.bool else x.detach().to(torch.float32 if x.is_floating_point() else torch.int64)
+    )
+
+
 def _untold(field: FieldVerdict) -> FieldVerdict:
     return replace(field, outcome="not covered", p_value=1.0) if field.outcome == "holds" else field
 
@@ -94,11 +102,13 @@ def _judge(element: Element, spaces: Spaces, halves: Sequence[_Half], first: Tra
     pays = any(bool(half.held.reward.any()) for half in halves)
     verdicts = []
     for name in halves[0].fields:
-        alone, squares, planted = (torch.cat([one.fields[name][k] for one in compared]) for k in range(3))
+        alone, planted, *others = (
+            torch.cat(parts) for parts in zip(*(one.fields[name] for one in compared), strict=True)
+        )
         still = all(float(half.spread[half.fields[name]].sum()) < STILL**2 for half in halves)
         # that it never changes is its law where it is seen; that of rewards and ends which never came is unknown
         of_nothing = concluded(name, 0.0, 0.0, broken=False, p_value=float(may_come(name, ends, pays)))
-        verdicts.append(of_nothing if still else _judged(name, alone, squares, planted[:, counts]))
+        verdicts.append(of_nothing if still else _judged(name, alone, planted[:, counts], others))
     found = ElementVerdict(element.name, declared, tuple(verdicts))
     image = turned(first, transform)
     shift, preference = _shift(first.obs, image.obs), _shift(done(first, spaces), done(image, spaces))
@@ -110,19 +120,18 @@ def _judge(element: Element, spaces: Spaces, halves: Sequence[_Half], first: Tra
     return found
 
 
-def _judged(name: str, alone: Tensor, squares: Tensor, planted: Tensor) -> FieldVerdict:
+def _judged(name: str, alone: Tensor, planted: Tensor, others: Sequence[Tensor]) -> FieldVerdict:
     """Judge one field by how much larger errors are on images, as shares of the variance.
 
-    `alone` [M] are squared errors of what follows, `squares` [M] those of its square, and `planted` [M, functions]
-    those of what follows with a breaking of the tolerance's size.
+    `alone` [M] are squared errors of what follows, `planted` [M, functions] those with a breaking of the tolerance's
+    size, and `others` [M] those of squares and products.
     """
     gap, error = _mean(alone)
     p_value = 1.0
     if planted.shape[1] and not _is_beyond(gap, error, _DOUBTFUL):
         expected, errors = _mean(planted - alone.unsqueeze(1))[0], _mean(planted)[1]
         p_value = float(torch.special.ndtr((gap - expected) / errors).max())
-    if name.startswith("obs."):
-        other, its_error = _mean(squares)
+    for other, its_error in map(_mean, others if name.startswith("obs.") else ()):
         if other / its_error > gap / error and _is_beyond(other, its_error):
             gap, error = other, its_error
     size = float(gap.clamp_min(0).sqrt())
@@ -137,7 +146,10 @@ class _Half:
         outputs, width = outputs_of(fitted), spaces.observation.width
         self._width, self._controls, self.held = outputs.shape[-1], controls, held
         self._mean, self._deviation = outputs.mean((0, 1, 2)), outputs.flatten(0, 2).std(0)
-        self._predict = Predictor(spaces, fitted, self._targets(fitted), controls(fitted))
+        places = spaces.observation.slices().values()
+        self._next = [k for where in places for k in (*range(where.start + 1, where.stop), where.start)]
+        functions = torch.cat([controls(fitted), self._products(fitted)], -1)
+        self._predict = Predictor(spaces, fitted, self._targets(fitted), functions)
         self._planted = controls(held)
         self._here = self._sides(held, self._planted)
         self._trust = trust_in(self._here.said, self._here.true)
@@ -167,29 +179,40 @@ class _Half:
             trust = trust_in(*sides[0])
             before, after = ((weight * (trust * said - true).square()).mean((1, 2)) for said, true in sides)
             others = (worse[..., where].sum(-1) - worse[..., main]).mean((1, 2)).unsqueeze(-1)
-            squares = worse[..., self._width :][..., where].sum(-1).mean((1, 2))
-            of_squares = self.spread[self._width :][where].sum().clamp_min(STILL**2)
-            alone = worse[..., where].sum(-1).mean((1, 2)) / variance
-            parts = alone, squares / of_squares, (after - before + others) / variance
+            alone, *of_chance = (
+                worse[..., begin:][..., where].sum(-1).mean((1, 2))
+                / self.spread[begin:][where].sum().clamp_min(STILL**2)
+                for begin in (0, self._width, 2 * self._width)
+            )
+            parts = alone, (after - before + others) / variance, *of_chance
             fields[name] = tuple(part.double() for part in parts)
         return _Compared(float(inside.mean()), counts, fields)
 
     def _sides(self, data: Transitions, functions: Tensor) -> Sides:
-        said, planted = self._predict(data)
-        mean = torch.cat([self._mean, torch.ones_like(self._mean)])
-        return Sides(said - mean, self._targets(data) - mean, planted, functions)
+        said, others = self._predict(data)
+        planted, products = others.tensor_split([functions.shape[-1]], -1)
+        mean = torch.cat([self._mean, torch.ones_like(self._mean), products.new_zeros(products.shape[-1])])
+        true = torch.cat([self._targets(data), self._products(data)], -1)
+        return Sides(torch.cat([said, products], -1) - mean, true - mean, planted, functions)
 
     def _targets(self, data: Transitions) -> Tensor:
         """Return what is predicted of each agent, and its square in standard deviations from the mean."""
-        outputs = outputs_of(data)
-        return torch.cat([outputs, ((outputs - self._mean) / self._deviation.clamp_min(STILL)).square()], -1)
+        return torch.cat([outputs_of(data), self._centred(data).square()], -1)
+
+    def _products(self, data: Transitions) -> Tensor:
+        """Return products of what is seen next with the next number of its field, in standard deviations."""
+        centred = self._centred(data)
+        return centred[..., : len(self._next)] * centred[..., self._next]
+
+    def _centred(self, data: Transitions) -> Tensor:
+        return (outputs_of(data) - self._mean) / self._deviation.clamp_min(STILL)
 
 
 class _Compared(NamedTuple):
     """How errors on images compare with those on originals.
 
-    Of each field, as shares of the variance, there are the excess of squared errors [M], of those of squares [M], and
-    with each control planted [M, functions].
+    Of each field, as shares of the variance, there are the excess of squared errors [M], with each control planted
+    [M, functions], and of those of squares and of products [M].
     """
 
     inside: float  # share of the images that lie where transitions do

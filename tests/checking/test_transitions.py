@@ -211,3 +211,26 @@ def test_what_moves_no_number_is_not_tried() -> None:
     flips = ["flip-x", "flip-diagonal", "flip-y", "flip-antidiagonal"]
     assert [element.name for element in candidates(leaning, "d4")] == flips, "turns move nothing of it"
     assert [element.name for element in candidates(leaning)] == ["flip-x"], "all mirrors are one"
+
+
+def gusts(kind: torch.dtype = torch.float32) -> tuple[Spaces, Transitions]:
+    """One point, moved by gusts along one diagonal."""
+    g = torch.Generator().manual_seed(0)
+    row = layout(Field("velocity", Kind.VECTOR))
+    spaces = Spaces(num_agents=1, observation=row, state=row, action=discrete_moves(4), symmetry="d4")
+    start, gust = torch.randn(4000, 1, 1, 2, generator=g), torch.randn(4000, 1, 1, 1, generator=g)
+    action = torch.randint(4, (4000, 1, 1), generator=g)
+    after = 0.8 * start + 0.3 * torch.tensor(discrete_moves(4).points)[action] + 0.5 * gust
+    return spaces, Transitions(start, action.to(torch.int32), (start.square().sum(-1) < 1).to(kind), after)
+
+
+def test_gusts_along_one_diagonal_break_what_turns_it() -> None:
+    spaces, data = gusts()
+    found = check_transitions(spaces, data, parse_elements("rot90,rot180,flip-x", 1))
+    assert {v.element: v.outcome for v in found} == {"rot90": "broken", "rot180": "holds", "flip-x": "broken"}
+
+
+def test_numbers_of_any_type_are_taken() -> None:
+    (_, of_flags), (spaces, of_numbers) = gusts(torch.bool), gusts()
+    found = [check_transitions(spaces, data, parse_elements("rot180", 1)) for data in (of_flags, of_numbers)]
+    assert found[0] == found[1]
