@@ -176,5 +176,6 @@ def _of_actuator(frame: Frame, match: Match, a: int) -> dict[str, float]:
 
 def _share(a: Floats | float, b: Floats | float) -> float:
     """Return the largest difference of two numbers or arrays over the largest of their sizes."""
+    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)  # switches too
     largest = max(np.abs(a).max(), np.abs(b).max())
-    return float(np.abs(np.subtract(a, b)).max() / largest) if largest > 1e-12 else 0.0
+    return float(np.abs(a - b).max() / largest) if largest > 1e-12 else 0.0

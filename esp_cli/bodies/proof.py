@@ -27,6 +27,7 @@ _NO_CONSTRAINTS, _NO_SENSORS, _NO_CONTACTS = (
     int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in ("CONSTRAINT", "SENSOR", "CONTACT")
 )
 _NO_LIMITS = int(mujoco.mjtDisableBit.mjDSBL_LIMIT | mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS) | _NO_CONTACTS
+_PARTS = ([2, 3, 5], [2], [], [])  # where (x, y), z, (roll, pitch) and yaw of a joint begin, by type
 Sample = tuple[Floats, Floats, Floats, Floats]  # qpos, qvel, ctrl and forces on the degrees of freedom
 
 
@@ -36,7 +37,8 @@ class Proof:
 
     Attributes:
         joints: [joints] the root mean square gap of the accelerations of each joint over theirs, without constraints;
-            of a model with equalities, as of closed loops and mimic joints, the larger of those with and without them.
+            of a free or ball joint the worst of (x, y), z, (roll, pitch) and yaw, each over its own size; of a model
+            with equalities, as of closed loops and mimic joints, the larger of those with and without them.
         planted: [joints] the smallest gap of mistakes planted at each.
         median: of the states' gaps: |difference| / |accelerations|.
         constraints: the same median with limits, friction and equalities.
@@ -196,8 +198,13 @@ def _gaps(frame: Frame, match: Match, here: Floats, there: Floats) -> tuple[Floa
     wanted = here @ match.qvel.T
     wrong, size = np.square(wanted - there), np.square(wanted)
     least = max(1e-12 * size.mean(), 1e-24)
-    spans = [frame.dofs_of(j) for j in range(frame.model.njnt)]
-    joints = np.array([np.sqrt(wrong[:, span].mean() / max(size[:, span].mean(), least)) for span in spans])
+    joints = np.zeros(frame.model.njnt)
+    for j, kind in enumerate(frame.model.jnt_type):
+        span = frame.dofs_of(j)
+        floor = max(1e-6 * size[:, span].mean(), least)  # a part that hardly moves shows rounding alone
+        for dofs in np.split(np.r_[span], _PARTS[kind]):
+            gap = np.sqrt(wrong[:, dofs].mean() / max(size[:, dofs].mean(), floor))
+            joints[j] = np.maximum(joints[j], gap)  # NaN stays
     return joints, np.sqrt(wrong.sum(1) / np.maximum(size.sum(1), 1e-24))
 
 
