@@ -10,9 +10,10 @@ import mujoco
 import numpy as np
 
 from esp_cli.bodies.deriving import Match, derive
-from esp_cli.bodies.frame import HINGE, SLIDE, Frame, image_of_axis
+from esp_cli.bodies.frame import HINGE, SLIDE, Frame, image_of_axis, share
 from esp_cli.bodies.proof import EXACT, Proof, prove
 from esp_cli.bodies.reading import printable
+from esp_cli.bodies.touching import shape_images, unlike_contacts
 from esp_cli.symmetry.elements import Floats
 from esp_cli.symmetry.plane import PlaneElement
 from esp_envs.errors import UserError
@@ -89,7 +90,7 @@ def find(frame: Frame, tolerated: float) -> tuple[dict[PlaneElement, Found], dic
                 for what in LIMITS
                 if one.shares.get(what, 0.0) > EXACT
             ]
-            proof = replace(proof, unlike=(*proof.unlike, *limits))
+            proof = replace(proof, unlike=(*proof.unlike, *unlike_contacts(frame, match, EXACT), *limits))
             found[element] = Found(match, proof, differ, None if frame.base is None else differ[frame.base])
     while lost := _outside(found, idle):
         del found[lost]
@@ -128,39 +129,26 @@ def _of_joint(frame: Frame, R: Floats, i: int, j: int) -> dict[str, float]:
     model = frame.model
     (b, c), (v, w) = model.jnt_bodyid[[i, j]], model.jnt_dofadr[[i, j]]
     shares = {
-        "mass": _share(frame.mass[b], frame.mass[c]),
+        "mass": share(frame.mass[b], frame.mass[c]),
         "middle of mass": float(np.linalg.norm(R @ frame.com[b] - frame.com[c]) / frame.size),
-        "geometry": max(_of_shapes(frame, R, b, c), _of_shapes(frame, R.T, c, b)),
-        "inertia": _share(R @ frame.inertia[b] @ R.T, frame.inertia[c]),
-        "damping": _share(model.dof_damping[v], model.dof_damping[w]),
-        "armature": _share(model.dof_armature[v], model.dof_armature[w]),
-        "friction": _share(model.dof_frictionloss[v], model.dof_frictionloss[w]),
-        "stiffness": _share(model.jnt_stiffness[i], model.jnt_stiffness[j]),
+        "geometry": max((gap for *_, gap in shape_images(frame, R, b, c)), default=0.0),
+        "inertia": share(R @ frame.inertia[b] @ R.T, frame.inertia[c]),
+        "damping": share(model.dof_damping[v], model.dof_damping[w]),
+        "armature": share(model.dof_armature[v], model.dof_armature[w]),
+        "friction": share(model.dof_frictionloss[v], model.dof_frictionloss[w]),
+        "stiffness": share(model.jnt_stiffness[i], model.jnt_stiffness[j]),
     }
     if model.jnt_type[i] in (SLIDE, HINGE):
         axis = image_of_axis(frame, R, i)
         sign = np.copysign(1.0, axis @ frame.axis[j])
         shares["axis"] = float(np.linalg.norm(axis - sign * frame.axis[j]))
         limits = [model.jnt_range[k] * model.jnt_limited[k] - model.qpos0[frame.qpos_of(k)] for k in (i, j)]
-        shares["range"] = _share(np.sort(sign * limits[0]), limits[1])
+        shares["range"] = share(np.sort(sign * limits[0]), limits[1])
         stops = [np.r_[model.jnt_solref[k], model.jnt_solimp[k], model.jnt_margin[k]] for k in (i, j)]
-        shares["stops"] = _share(*stops) if model.jnt_limited[i] or model.jnt_limited[j] else 0.0
+        shares["stops"] = share(*stops) if model.jnt_limited[i] or model.jnt_limited[j] else 0.0
         torques = [model.jnt_actfrcrange[k] * model.jnt_actfrclimited[k] for k in (i, j)]
-        shares["torque range"] = _share(np.sort(sign * torques[0]), torques[1])
+        shares["torque range"] = share(np.sort(sign * torques[0]), torques[1])
     return shares
-
-
-def _of_shapes(frame: Frame, R: Floats, b: int, c: int) -> float:
-    """Return how far what collides of a body is from the nearest of its kind on another, at most 1."""
-    worst = 0.0
-    for kind, place, spread in frame.shapes.get(b, []):
-        gaps = [
-            max(float(np.linalg.norm(R @ place - there) / frame.size), _share(R @ spread @ R.T, other))
-            for like, there, other in frame.shapes.get(c, [])
-            if like == kind
-        ]
-        worst = max(worst, min(gaps, default=1.0))
-    return min(worst, 1.0)
 
 
 def _of_actuator(frame: Frame, match: Match, a: int) -> dict[str, float]:
@@ -171,11 +159,4 @@ def _of_actuator(frame: Frame, match: Match, a: int) -> dict[str, float]:
         limits = getattr(model, f"actuator_{name}range") * getattr(model, f"actuator_{name}limited")[:, None]
         values[what] = [np.sort(match.ctrl[b, a] * limits[a]), limits[b]]
     values["gear"] = np.abs(model.actuator_gear[[a, b]])
-    return {what: _share(*pair) for what, pair in values.items()}
-
-
-def _share(a: Floats | float, b: Floats | float) -> float:
-    """Return the largest difference of two numbers or arrays over the largest of their sizes."""
-    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)  # switches too
-    largest = max(np.abs(a).max(), np.abs(b).max())
-    return float(np.abs(a - b).max() / largest) if largest > 1e-12 else 0.0
+    return {what: share(*pair) for what, pair in values.items()}

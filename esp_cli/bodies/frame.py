@@ -46,7 +46,7 @@ class Frame:
         self.anchor, self.axis = data.xanchor - self.centre, data.xaxis.copy()
         self.turned = data.xmat.reshape(-1, 3, 3).copy()
         axes = data.ximat.reshape(-1, 3, 3)
-        self._geoms = data.geom_xpos - self.centre, data.geom_xmat.reshape(-1, 3, 3).copy()
+        self.geom_places, self._geom_axes = data.geom_xpos - self.centre, data.geom_xmat.reshape(-1, 3, 3).copy()
         self.inertia = axes * model.body_inertia[:, None] @ axes.transpose(0, 2, 1)
         self.mass, self.com = self._rigid_parts(data.xipos - self.centre)
         spread = np.concatenate([self.anchor, self.com[self.moving]])
@@ -83,14 +83,37 @@ class Frame:
         return mass, moment / np.maximum(mass, 1e-12)[:, None]
 
     @cached_property
-    def shapes(self) -> dict[int, list[tuple[int, Floats, Floats]]]:
-        """By moving body: type, middle [3], squared extent [3, 3] of each shape that collides; a mesh has no extent."""
-        model, found = self.model, dict[int, list[tuple[int, Floats, Floats]]]()
-        for g in np.flatnonzero(model.geom_contype | model.geom_conaffinity):
-            kind, axes = int(model.geom_type[g]), self._geoms[1][g]
+    def touching(self) -> Any:
+        """[geoms, geoms] which may touch each other, as masks, exclusions and pairs of contacts have it."""
+        model, body = self.model, self.model.geom_bodyid
+        masks = model.geom_contype[:, None] & model.geom_conaffinity
+        may = (masks | masks.T) != 0
+        for signature in model.exclude_signature:
+            one, other = body == signature >> 16, body == signature & 0xFFFF
+            may[np.ix_(one, other)] = may[np.ix_(other, one)] = False
+        owner = model.body_weldid  # what is fixed to a body moves with it, and touches neither it nor its parent
+        parent = np.where(owner > 0, owner[model.body_parentid[owner]], -1)[body]
+        owner = owner[body]
+        near = (owner[:, None] == owner) | ((parent[:, None] == owner) & (owner > 0))
+        may &= ~(near | near.T)
+        may[[model.pair_geom1, model.pair_geom2], [model.pair_geom2, model.pair_geom1]] = True
+        return may
+
+    @cached_property
+    def shapes(self) -> dict[int, list[tuple[int, int, Floats, Floats]]]:
+        """By moving body, or the world (0), all that may touch: geom, type, middle [3], squared extent [3, 3].
+
+        A mesh has no extent; of a plane, the middle is a point over it, above or below `centre`.
+        """
+        model, found = self.model, dict[int, list[tuple[int, int, Floats, Floats]]]()
+        for g in np.flatnonzero(self.touching.any(1)).tolist():
+            kind, place, axes = int(model.geom_type[g]), self.geom_places[g], self._geom_axes[g]
             half = model.geom_aabb[g, 3:] * (kind != mujoco.mjtGeom.mjGEOM_MESH)
-            body = int(model.body_weldid[model.geom_bodyid[g]])
-            found.setdefault(body, []).append((kind, self._geoms[0][g], axes * half**2 @ axes.T))
+            if kind == mujoco.mjtGeom.mjGEOM_PLANE:
+                half, place = np.zeros(3), axes[:, 2] * (axes[:, 2] @ place + self.size)
+            found.setdefault(int(model.body_weldid[model.geom_bodyid[g]]), []).append(
+                (g, kind, place, axes * half**2 @ axes.T)
+            )
         return found
 
     @cached_property
@@ -124,3 +147,10 @@ def clean(x: Floats) -> Floats:
     """Return numbers with what differs from a whole number by rounding alone made whole."""
     whole = np.rint(x)
     return np.where(np.abs(x - whole) < 1e-9, whole, x) + 0.0
+
+
+def share(a: Floats | float, b: Floats | float) -> float:
+    """Return the largest difference of two numbers or arrays over the largest of their sizes."""
+    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)  # switches too
+    largest = max(np.abs(a).max(), np.abs(b).max())
+    return float(np.abs(a - b).max() / largest) if largest > 1e-12 else 0.0

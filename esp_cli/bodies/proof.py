@@ -46,8 +46,8 @@ class Proof:
         worst: the largest gap of a state with any of these.
         sensors: by name, the gap of a sensor's readings, turned as fits best, from those of its image, the sensor of
             its kind that fits best: a share of their own spread, without constraints.
-        unlike: what is not as that of its image, though no state need show it: contacts of bodies that may touch, where
-            their images may not, limits of joints and actuators.
+        unlike: what is not as that of its image, or not covered, though no state need show it: shapes and contacts,
+            limits of joints, tendons and actuators, sampling of sensors.
         unjudged: kinds of sensors that are not compared: they show nothing without constraints, as those of touch, or
             attitudes, or are of `NO_MIRROR`.
     """
@@ -135,8 +135,10 @@ def prove(frame: Frame, match: Match, seed: int = 0) -> Proof:
     held = [_gaps(frame, match, *pair)[1] for pair in pairs]
     median, *medians = (float(np.median(gaps)) for gaps in (free, *held))
     worst, sensors = float(np.concatenate(held).max()), _sensors(frame.model, here, there)
+    unmet = ("contacts with the world (not covered: no state has any)",)
+    unmet *= frame.base is not None and 0 in frame.shapes and not lying
     lain = medians[2] if lying else None
-    return Proof(joints, np.array(planted), median, medians[0], lain, worst, *sensors, _unlike_contacts(frame, match))
+    return Proof(joints, np.array(planted), median, medians[0], lain, worst, *sensors, unmet)
 
 
 def _state(frame: Frame, data: Any, rng: np.random.Generator) -> Sample:
@@ -230,27 +232,6 @@ def _sensors(model: Any, here: Floats, there: Floats) -> tuple[dict[str, float],
     return found, tuple(sorted(unjudged))
 
 
-def _unlike_contacts(frame: Frame, match: Match) -> tuple[str, ...]:
-    """Return the pairs of bodies that may touch where their images may not, as an exclusion or a mask makes them."""
-    model = frame.model
-    masks = model.geom_contype[:, None] & model.geom_conaffinity
-    one, other = (model.geom_bodyid[geoms] for geoms in np.nonzero(masks | masks.T))
-    may = np.zeros((model.nbody, model.nbody), dtype=bool)
-    may[one, other] = True
-    may[model.exclude_signature >> 16, model.exclude_signature & 0xFFFF] = False
-    owner = model.body_weldid  # what is fixed to a body moves with it, and touches neither it nor its parent
-    parent = np.where(owner > 0, owner[model.body_parentid[owner]], -1)
-    may &= (owner[:, None] != owner) & ~((parent[:, None] == owner) & (owner > 0))
-    may &= may.T
-    pairs = model.geom_bodyid[[model.pair_geom1, model.pair_geom2]]
-    may[pairs, pairs[::-1]] = True
-    image = np.where(match.bodies.any(0), match.bodies.argmax(0), -1)
-    image[0] = 0
-    known = [b for b in range(model.nbody) if image[b] >= 0]
-    lost = [(b, c) for b in known for c in known if b < c and may[b, c] and not may[image[b], image[c]]]
-    return tuple("contact of " + " and ".join(printable(frame.name("body", b)) for b in pair) for pair in lost)
-
-
 def _mistakes(frame: Frame, match: Match, joint: int) -> Iterator[Match]:
     """Yield matches with one mistake at a joint: a wrong sign of it and its partner, and both kept in place."""
     partner = int(match.joint[joint])
@@ -279,11 +260,14 @@ def _lowered(frame: Frame, data: Any, sample: Sample) -> Sample | None:
         mujoco.mj_fwdPosition(data.model, data)
         return int(data.ncon)
 
-    high, low = sample[0][height] + 4 * frame.size, sample[0][height] - 4 * frame.size
-    own = touches(high)
-    if touches(low) <= own:
+    start, reach = float(sample[0][height]), 4 * frame.size
+    # a robot that begins high finds a floor at the middle of what stands in the world
+    stands = sorted((float(frame.geom_places[g, 2]) for g, *_ in frame.shapes.get(0, [])), reverse=True)
+    high, own = start + reach, touches(start + reach)
+    low = next((z for z in (start - reach, *stands) if z < start and touches(z) > own), None)
+    if low is None:
         return None
-    for _ in range(10):
+    while high - low > reach / 500:
         middle = (high + low) / 2
         high, low = (high, middle) if touches(middle) > own else (middle, low)
     qpos = sample[0].copy()

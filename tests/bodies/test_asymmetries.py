@@ -49,3 +49,60 @@ def test_a_wrong_yaw_does_not_drown_in_lift_and_roll(spins, group):
     assert body_of(drone(spins)).group == group
 
 
+@pytest.mark.parametrize("floor", [FLOOR, '<geom type="box" size="9 9 0.01"/>'])
+def test_a_robot_that_begins_high_is_lowered_to_the_floor(floor):
+    proof = proof_of(changed('pos="0 0 1"', 'pos="0 0 30"').replace(FLOOR, floor))
+    assert proof.contacts is not None
+    assert (proof.verdict, proof.contacts < 1e-9) == ("exact", True)
+
+
+def test_contacts_that_no_state_has_are_not_covered():
+    text = changed("<worldbody>", '<worldbody><geom size="0.1" pos="9 0 0"/>').replace(FLOOR, "")
+    assert proof_of(text).unlike == ("contacts with the world (not covered: no state has any)",)
+
+
+HOW = {
+    'friction="2 0.1 0.1"': "friction",
+    'solref="0.1 1"': "solref",
+    'solimp="0.8 0.9 0.01"': "solimp",
+    'margin="0.1"': "margin",
+    'condim="1"': "condim",
+    'priority="1"': "priority",
+    'mass="1" euler="0 0 20"': "shape",
+}
+
+
+@pytest.mark.parametrize("how", HOW)
+def test_a_foot_of_a_robot_held_in_the_air_touches_as_its_image_does(how):
+    text = biped().replace(FREE, "").replace('pos="0 0 1"', 'pos="0 0 3"').replace(FOOT, f'{FOOT} mass="1"')
+    assert proof_of(text).verdict == "exact"
+    own = how if "mass" in how else f'mass="1" {how}'
+    inertial = '<inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/><geom type="box" size="0.1 0.04 0.02"'
+    text = text.replace('<geom type="box" size="0.1 0.04 0.02"', inertial)
+    proof = proof_of(changed(f'{FOOT} mass="1"', f"{FOOT} {own}", text))
+    assert proof.unlike == (f"{HOW[how]} of geom#5 of left_foot", f"{HOW[how]} of geom#8 of right_foot")
+    assert proof.verdict == "nearly"
+
+
+def test_pairs_of_contacts_are_compared():
+    text = changed(FOOT, f'{FOOT} name="left"').replace(f"{FOOT}/>", f'{FOOT} name="right"/>')
+    text = changed(FLOOR, FLOOR.replace("<geom", '<geom name="floor"'), text)
+    pair = '<pair geom1="{}" geom2="floor" condim="{}"/>'
+    told = "<contact>{}</contact><actuator>"
+    alike = changed("<actuator>", told.format(pair.format("left", 3) + pair.format("right", 3)), text)
+    assert proof_of(alike).verdict == "exact"
+    assert proof_of(changed('condim="3"', 'condim="4"', alike)).unlike == (
+        "contact pair of floor and left",
+        "contact pair of floor and right",
+    )
+    alone = proof_of(changed("<actuator>", told.format(pair.format("left", 3)), text))
+    assert alone.unlike == ("contact pair of floor and left",)
+
+
+@pytest.mark.parametrize("free", [FREE, ""])
+def test_a_wall_has_its_image_about_the_base(free):
+    wall = '<geom name="{}" type="box" size="3 0.1 2" pos="0 {} 0"/>'
+    text = biped().replace(FREE, free)
+    one = changed(FLOOR, FLOOR + wall.format("left", 4), text)
+    assert proof_of(one).unlike == ("shape of left",)
+    assert proof_of(changed(FLOOR, FLOOR + wall.format("right", -4), one)).verdict == "exact"

@@ -1,0 +1,68 @@
+"""What a model may touch, and how: its shapes and contacts beside those of their images, though no state meets them."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from esp_cli.bodies.deriving import Match
+from esp_cli.bodies.frame import Frame, share
+from esp_cli.bodies.reading import printable
+from esp_cli.symmetry.elements import Floats
+
+_OF_A_GEOM = ("friction", "solref", "solimp", "margin", "gap", "condim", "priority", "solmix", "adhesion")
+_OF_A_PAIR = ("friction", "solref", "solimp", "margin", "gap", "dim", "solreffriction", "adhesion")
+
+
+def shape_images(frame: Frame, R: Floats, b: int, c: int) -> list[tuple[int, int, float]]:
+    """Return each shape of a moving body that may touch something, its image on another (-1: none), and their gap."""
+    own, other = frame.shapes.get(b, []), frame.shapes.get(c, [])
+    contacts = _properties(frame, "geom", _OF_A_GEOM)
+    table = np.ones((len(own), len(other)))
+    for row, (g, kind, place, spread) in zip(table, own, strict=True):
+        for k, (h, like, there, extent) in enumerate(other):
+            if like == kind:
+                off = float(np.linalg.norm(R @ place - there)) / frame.size
+                row[k] = min(max(off, share(R @ spread @ R.T, extent)), 0.99)  # rather than one of another type
+                row[k] += 1e-9 * any(share(x[g], x[h]) > 0 for x in contacts.values())  # of two at one place
+    found = {int(i): int(k) for i, k in zip(*linear_sum_assignment(table), strict=True)}
+    return [
+        (own[i][0], other[found[i]][0], min(float(table[i, found[i]]), 1.0)) if i in found else (own[i][0], -1, 1.0)
+        for i in range(len(own))
+    ]
+
+
+def unlike_contacts(frame: Frame, match: Match, wrong: float) -> tuple[str, ...]:
+    """Return what may touch otherwise than its image, by a share of more than `wrong`."""
+    model, image = frame.model, np.where(match.bodies.any(0), match.bodies.argmax(0), -1)
+    image[0] = 0
+    may, geoms, found = frame.touching, np.full(frame.model.ngeom, -1), list[str]()
+    contacts = _properties(frame, "geom", _OF_A_GEOM)
+    for b in frame.shapes:
+        for g, h, gap in shape_images(frame, match.world, b, int(image[b])):
+            geoms[g] = h
+            unlike = ["shape"] * (gap > wrong)
+            unlike += [what for what, x in contacts.items() if h >= 0 and share(x[g], x[h]) > wrong]
+            found += [f"{what} of {_name(frame, g)}" for what in unlike]
+    bodies = np.zeros((model.nbody, model.nbody), dtype=bool)
+    np.logical_or.at(bodies, tuple(model.geom_bodyid[np.array(np.nonzero(may))]), True)
+    known = [b for b in range(model.nbody) if image[b] >= 0]
+    lost = [(b, c) for b in known for c in known if b < c and bodies[b, c] and not bodies[image[b], image[c]]]
+    found += ["contact of " + " and ".join(printable(frame.name("body", b)) for b in pair) for pair in lost]
+    told = _properties(frame, "pair", _OF_A_PAIR)
+    pairs = {frozenset(pair): k for k, pair in enumerate(zip(model.pair_geom1, model.pair_geom2, strict=True))}
+    for pair, k in pairs.items():
+        other = pairs.get(frozenset(geoms[list(pair)]))
+        if other is None or any(share(x[k], x[other]) > wrong for x in told.values()):
+            found.append("contact pair of " + " and ".join(_name(frame, g) for g in sorted(pair)))
+    return tuple(found)
+
+
+def _properties(frame: Frame, of: str, names: tuple[str, ...]) -> dict[str, Floats]:
+    """Return by name the properties [count, ...] of geoms or pairs that this MuJoCo knows."""
+    return {what: values for what in names if (values := getattr(frame.model, f"{of}_{what}", None)) is not None}
+
+
+def _name(frame: Frame, geom: int) -> str:
+    body = frame.name("body", int(frame.model.geom_bodyid[geom]))
+    return printable(frame.model.geom(geom).name or f"geom#{geom} of {body}")
