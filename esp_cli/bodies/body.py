@@ -148,6 +148,8 @@ class Body:
             if first
             else f"{printable(shifted[0])} has a reference that is not its image's, so its state has no layout"
             if shifted
+            else "the base does not begin over the origin, so its state has no layout; leave x and y of its pos out"
+            if any(np.any(m.offset) for m in matches.values())
             else ""
         )
         return self
@@ -246,8 +248,8 @@ class Body:
         """Return the layout of MuJoCo's qpos and qvel: `simulated` of a task, whose states checks can pair.
 
         Raises:
-            UserError: the body is not that of a model, its free joint is not the first, or a joint's reference is not
-                that of its image.
+            UserError: the body is not that of a model, its free joint is not the first, its base begins off the origin
+                so that images of places shift, or a joint's reference is not that of its image.
         """
         if self._stateless:
             raise UserError(self._stateless)
