@@ -22,12 +22,18 @@ EXACT, NEARLY = 1e-5, 0.05  # largest gap of a mirror exact up to rounding, and 
 SEEN = 3.0  # how many times the gap of a planted mistake exceeds the gap without it, where the proof would have seen it
 NO_MIRROR = (mujoco.mjtSensor.mjSENS_USER, mujoco.mjtSensor.mjSENS_PLUGIN)
 """Kinds of sensors of which nobody knows what their readings mean."""
+_OF_A_SENSOR = ("interval", "delay", "noise", "cutoff")  # of which a MuJoCo may know some alone
 _STATES, _LYING, _PLANTED = 48, 24, 12  # states that are compared, that are laid on the floor, and for each mistake
 _NO_CONSTRAINTS, _NO_SENSORS, _NO_CONTACTS = (
     int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in ("CONSTRAINT", "SENSOR", "CONTACT")
 )
 _NO_LIMITS = int(mujoco.mjtDisableBit.mjDSBL_LIMIT | mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS) | _NO_CONTACTS
-_PARTS = ([2, 3, 5], [2], [], [])  # where (x, y), z, (roll, pitch) and yaw of a joint begin, by type
+_PARTS: tuple[list[int], ...] = (
+    [2, 3, 5],
+    [2],
+    [],
+    [],
+)  # where (x, y), z, (roll, pitch) and yaw of a joint begin, by type
 Sample = tuple[Floats, Floats, Floats, Floats]  # qpos, qvel, ctrl and forces on the degrees of freedom
 
 
@@ -134,11 +140,12 @@ def prove(frame: Frame, match: Match, seed: int = 0) -> Proof:
     ]
     held = [_gaps(frame, match, *pair)[1] for pair in pairs]
     median, *medians = (float(np.median(gaps)) for gaps in (free, *held))
-    worst, sensors = float(np.concatenate(held).max()), _sensors(frame.model, here, there)
+    worst = float(np.concatenate(held).max())
+    sensors, unjudged, unlike = _sensors(frame.model, here, there)
     unmet = ("contacts with the world (not covered: no state has any)",)
-    unmet *= frame.base is not None and 0 in frame.shapes and not lying
+    unlike += unmet * (frame.base is not None and 0 in frame.shapes and not lying)
     lain = medians[2] if lying else None
-    return Proof(joints, np.array(planted), median, medians[0], lain, worst, *sensors, unmet)
+    return Proof(joints, np.array(planted), median, medians[0], lain, worst, sensors, unjudged, unlike)
 
 
 def _state(frame: Frame, data: Any, rng: np.random.Generator) -> Sample:
@@ -210,12 +217,13 @@ def _gaps(frame: Frame, match: Match, here: Floats, there: Floats) -> tuple[Floa
     return joints, np.sqrt(wrong.sum(1) / np.maximum(size.sum(1), 1e-24))
 
 
-def _sensors(model: Any, here: Floats, there: Floats) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Return the gap of each sensor by its name, and the kinds of sensors that are not judged; see `Proof`."""
+def _sensors(model: Any, here: Floats, there: Floats) -> tuple[dict[str, float], tuple[str, ...], tuple[str, ...]]:
+    """Return the gap of each sensor by its name, the kinds that are not judged, and what is unlike; see `Proof`."""
     alike: dict[tuple[int, int], list[int]] = {}
     for s, (kind, width) in enumerate(zip(model.sensor_type.tolist(), model.sensor_dim.tolist(), strict=True)):
         alike.setdefault((kind, width), []).append(s)
-    found, unjudged = dict[str, float](), set[str]()
+    found, unjudged, unlike = dict[str, float](), set[str](), list[str]()
+    how = {what: getattr(model, f"sensor_{what}") for what in _OF_A_SENSOR if hasattr(model, f"sensor_{what}")}
     for (kind, width), some in alike.items():
         index = model.nv + model.sensor_adr[some][:, None] + np.arange(width)
         # readings [sensors, states, width] are compared up to where their zero is
@@ -227,9 +235,14 @@ def _sensors(model: Any, here: Floats, there: Floats) -> tuple[dict[str, float],
                 continue
             # the turn that fits best leaves |x|^2 + |y|^2 - 2 (the sum of the singular values of x'y)
             fit = np.linalg.svd(np.einsum("si,nsj->nij", own[k], other), compute_uv=False).sum(-1)
-            left = float((size[k] + there_size - 2 * fit).min() / size[k])
-            found[printable(model.sensor(s).name or f"sensor {s}")] = max(left, 0.0) ** 0.5
-    return found, tuple(sorted(unjudged))
+            left = np.sqrt(np.maximum(size[k] + there_size - 2 * fit, 0) / size[k])
+            name = printable(model.sensor(s).name or f"sensor {s}")
+            found[name] = float(left.min())
+            images = np.array(some)[left <= max(left.min(), EXACT)]
+            unlike += [
+                f"{what} of {name}" for what, x in how.items() if not any(np.array_equal(x[s], x[i]) for i in images)
+            ]
+    return found, tuple(sorted(unjudged)), tuple(unlike)
 
 
 def _mistakes(frame: Frame, match: Match, joint: int) -> Iterator[Match]:
