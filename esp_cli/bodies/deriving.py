@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from difflib import SequenceMatcher
+from functools import cache, partial
 from typing import Any
 
 import mujoco
@@ -25,7 +26,8 @@ from esp_envs.errors import UserError
 LOOSE = 0.1  # how far a matched joint's line may be off, as a share of the robot's size, or of its axis' length
 FAR = 0.25  # how far a body's middle of mass may be off, as a share of the robot's size, to be matched
 _APART = 1e6
-_UNLIKE = 0.02  # gap of servos of position and of velocity, which are matched where there is no better
+_UNLIKE = 0.01  # gap of actuators of other gain, bias or ranges, which are matched where there is no better
+_SLOWER = 0.05  # share by which time constants and delays of an actuator may be off its image's
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,7 @@ class Match:
     offset: Floats  # [nq]; 0 but for joints whose reference is not 0, and a base away from the origin
     qvel: Floats  # [nv, nv]
     ctrl: Floats  # [nu, nu]
+    tendons: Floats  # [tendons, tendons]; a column of 0 where one has no image
     unmatched: tuple[str, ...]  # names of actuators that have no image; their rows and columns are 0
 
     @property
@@ -64,9 +67,10 @@ def derive(frame: Frame, element: PlaneElement) -> Match:
             raise UserError("its bodies hang together otherwise")
         raise UserError(f"no joint is like the image of {printable(frame.name('joint', alone))}")
     qpos, offset, qvel = _state_maps(frame, R, joints)
-    ctrl, unmatched = _control_map(frame, qvel)
+    every_body = _all_bodies(frame, R, bodies)
+    ctrl, tendons, unmatched = _pulled_maps(frame, every_body, qpos, offset, qvel)
     joint = np.array([joints[j] for j in range(frame.model.njnt)])
-    return Match(element, R, _all_bodies(frame, R, bodies), joint, qpos, offset, qvel, ctrl, unmatched)
+    return Match(element, R, every_body, joint, qpos, offset, qvel, ctrl, tendons, unmatched)
 
 
 def _matched(frame: Frame, R: Floats) -> tuple[dict[int, int], dict[int, int]]:
@@ -156,49 +160,101 @@ def _times(q: Floats) -> Floats:
     return np.array([[w, -x, -y, -z], [x, w, z, -y], [y, -z, w, x], [z, y, -x, w]])
 
 
-def _control_map(frame: Frame, qvel: Floats) -> tuple[Floats, tuple[str, ...]]:
-    """Return the map of controls, and the actuators without an image: none pulls with the image of its moment [nv]."""
-    model = frame.model
-    data = mujoco.MjData(model)
-    mujoco.mj_fwdPosition(model, data)
-    moment = np.zeros((model.nu, model.nv))
-    if model.nu:
-        mujoco.mju_sparse2dense(
-            moment, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
-        )
-    scale = np.abs(moment).max(axis=1, initial=0)
-    unit = moment / np.where(scale > 0, scale, 1)[:, None]
-    image, ctrl = unit @ qvel.T, np.zeros((model.nu, model.nu))
-    dynamics = model.actuator_dyntype, model.actuator_dynprm * (model.actuator_dyntype != 0)[:, None]
-    types = np.column_stack([model.actuator_gaintype, model.actuator_biastype, *dynamics, model.actuator_delay])
-    servos = model.actuator_biasprm != 0  # of position or of velocity, in any order on each side
-    gaps = np.abs(image[:, None] - np.stack([unit, -unit])[:, None]).max(-1, initial=0)
-    gap = gaps.min(0) + _APART * (types[:, None] != types).any(-1)
-    gap += 0.1 * np.abs(np.subtract.outer(scale, scale)) / max(scale.max(initial=0), 1e-12)
-    gap += 1e-9 * (gaps[0] > gaps[1])  # two that pull one joint opposite ways: each has an image of its own sense
-    gap += _UNLIKE * (servos[:, None] != servos).any(-1)
-    mirrored = [a for a in range(model.nu) if scale[a] > 0]
-    unmatched = {a for a in range(model.nu) if scale[a] == 0}
-    for a, b in zip(*linear_sum_assignment(gap[np.ix_(mirrored, mirrored)]), strict=True):
-        i, j = mirrored[a], mirrored[b]
-        if gap[i, j] > 3 * LOOSE:
-            unmatched.add(i)
-        else:
-            ctrl[j, i] = 1.0 if gaps[0, i, j] <= gaps[1, i, j] else -1.0
-    return ctrl, tuple(printable(frame.name("actuator", a)) for a in sorted(unmatched))
+def _pulls(frame: Frame, qpos: Floats) -> Floats:
+    """Return how actuators, then tendons, pull at each degree of freedom, [nu + tendons, nv]: by how they shorten."""
+    data = mujoco.MjData(frame.model)
+    data.qpos[:] = qpos
+    mujoco.mj_fwdPosition(frame.model, data)
+    columns = []
+    for data.qvel[:] in np.eye(frame.model.nv):
+        mujoco.mj_fwdVelocity(frame.model, data)
+        columns.append(np.r_[data.actuator_velocity, data.ten_velocity])
+    return np.stack(columns, 1)
+
+
+def _pulled_maps(
+    frame: Frame, bodies: Floats, qpos: Floats, offset: Floats, qvel: Floats
+) -> tuple[Floats, Floats, tuple[str, ...]]:
+    """Return the maps of controls and of tendons, and the actuators without an image.
+
+    None pulls with the image of their moment at rest and in another pose, for none of which all may be 0, or none acts
+    on the image of their body.
+    """
+    model, rest = frame.model, frame.model.qpos0
+    other = rest.copy()
+    mujoco.mj_integratePos(model, other, 0.3 * np.random.default_rng(0).normal(size=model.nv), 1.0)
+    here = np.hstack([_pulls(frame, q) @ qvel.T for q in (rest, other)])
+    there = np.hstack([_pulls(frame, qpos @ q + offset) for q in (rest, other)])
+    tendons = _images(here[model.nu :], there[model.nu :], np.zeros((2, 1, 1)))
+    on_body = model.actuator_trntype == mujoco.mjtTrn.mjTRN_BODY  # pulls where it touches, as adhesion does
+    held = np.eye(model.nbody)[model.actuator_trnid[:, 0] * on_body] * on_body[:, None]
+    if idle := [a for a in range(model.nu) if not (on_body[a] or np.abs(here[a]).max() > 1e-9)]:
+        names = ", ".join(printable(frame.name("actuator", a)) for a in idle)
+        raise UserError(f"not covered: in no pose that was looked at does anything pull of the actuators {names}")
+    turned = np.where((model.actuator_gaintype == 0) & (model.actuator_gainprm[:, 0] < 0), -1.0, 1.0)[:, None]
+    here, there = (turned * x[: model.nu] * ~on_body[:, None] for x in (here, there))
+    ctrl = _images(np.hstack([here, held @ bodies.T]), np.hstack([there, held]), _unlike_actuators(model))
+    lost = np.flatnonzero(~ctrl.any(0)).tolist()
+    return ctrl, tendons, tuple(printable(frame.name("actuator", a)) for a in lost)
+
+
+def _images(here: Floats, there: Floats, unlike: Floats) -> Floats:
+    """Return the signed map [n, n] of what pulls: image `here` [n, k] to `there`; `unlike` [2, n, n] adds to its cost.
+
+    Its first part is of images that pull, its second of those that are pushed where their original is pulled.
+    """
+    scales = [np.abs(x).max(axis=1, initial=0) for x in (here, there)]
+    unit, other = (
+        x / np.where(size > 1e-9, size, np.inf)[:, None] for x, size in zip((here, there), scales, strict=True)
+    )
+    gaps = np.abs(unit[:, None] - np.stack([other, -other])[:, None]).max(-1, initial=0) + unlike
+    gaps += 0.1 * np.abs(np.subtract.outer(*scales)) / max(scales[0].max(initial=0), 1e-12)
+    gaps[1] += 1e-9  # two that pull one joint opposite ways: each has an image of its own sense
+    found, pulling = np.zeros((len(here),) * 2), np.flatnonzero(unit.any(1))
+    gap = gaps.min(0)[pulling]
+    for i, b in zip(*linear_sum_assignment(gap), strict=True):
+        if gap[i, b] <= 3 * LOOSE:
+            found[b, pulling[i]] = 1.0 if gaps[0, pulling[i], b] <= gaps[1, pulling[i], b] else -1.0
+    return found
+
+
+def _unlike_actuators(model: Any) -> Floats:
+    """Return how unlike actuators are, [2, nu, nu]: as they are, and with the control of the second reversed."""
+
+    def apart(x: Floats, y: Floats) -> Floats:
+        largest = np.maximum.outer(np.abs(x).max(-1), np.abs(y).max(-1))
+        return np.abs(x[:, None] - y).max(-1) / np.maximum(largest, 1e-12)
+
+    dynamic = (model.actuator_dyntype != 0)[:, None]
+    types = np.column_stack([getattr(model, f"actuator_{of}type") for of in ("gain", "bias", "dyn")])
+    ranges = [
+        getattr(model, f"actuator_{of}range") * getattr(model, f"actuator_{of}limited")[:, None]
+        for of in ("ctrl", "force", "act")
+    ]
+    slow = [apart(x, x) for x in (model.actuator_dynprm * dynamic, model.actuator_delay[:, None])]
+    alike = [apart(x, x) for x in (np.abs(model.actuator_gainprm), model.actuator_biasprm)]
+    gap = _UNLIKE * sum([*slow, *alike]) + _APART * (types[:, None] != types).any(-1)
+    gap += _APART * sum(x > _SLOWER for x in slow)
+    return np.stack(
+        [
+            gap + _UNLIKE * sum(apart(x, y) for x, y in zip(ranges, other, strict=True))
+            for other in (ranges, [-x[:, ::-1] for x in ranges])
+        ]
+    )
 
 
 def _all_bodies(frame: Frame, R: Floats, moved: dict[int, int]) -> Floats:
-    """Return [bodies, bodies] where each goes, fixed ones to the nearest that is fixed to their carrier's image."""
-    count = frame.model.nbody
+    """Return [bodies, bodies] where each goes, fixed ones each to its own that is fixed to their carrier's image."""
+    count, name = frame.model.nbody, partial(frame.name, "body")
     where = np.zeros((count, count))
-    for b in range(count):
-        if b in moved:
-            where[moved[b], b] = 1
-            continue
-        carrier = moved[frame.carrier(b)]
-        like = [c for c in range(1, count) if c not in moved and frame.carrier(c) == carrier]
-        gaps = [float(np.abs(frame.places[b] @ R.T - frame.places[c]).max()) / frame.size for c in like]
-        if gaps and min(gaps) < LOOSE:
-            where[like[int(np.argmin(gaps))], b] = 1
+    where[list(moved.values()), list(moved)] = 1
+    fixed = [b for b in range(count) if b not in moved]
+    for carrier, image in moved.items():
+        own, other = ([b for b in fixed if frame.carrier(b) == on] for on in (carrier, image))
+        gaps = np.abs((frame.places[own] @ R.T)[:, None] - frame.places[other]).max((-1, -2)) / frame.size
+        for i, k in np.argwhere(gaps < LOOSE):  # of some at one place, those whose names are alike
+            frame.stop_if_late()
+            gaps[i, k] += 1e-6 * (1 - SequenceMatcher(None, name(own[i]), name(other[k])).ratio())
+        for i, k in zip(*linear_sum_assignment(gaps), strict=True):
+            where[other[k], own[i]] = gaps[i, k] < LOOSE
     return where

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from esp_cli.bodies.deriving import Match, derive
-from esp_cli.bodies.frame import HINGE, SLIDE, Frame, image_of_axis, share
+from esp_cli.bodies.frame import BALL, HINGE, SLIDE, Frame, image_of_axis, share
 from esp_cli.bodies.proof import EXACT, Proof, prove
 from esp_cli.bodies.reading import printable
 from esp_cli.bodies.touching import shape_images, unlike_contacts
@@ -29,8 +29,12 @@ TRIED = tuple(
 )
 """The elements that a model is searched for: turns by 1/2 to 1/8, and mirrors in lines between which such turns lie."""
 
-LIMITS = ("range", "stops", "torque range", "force range", "control range", "activation range", "early activation")
+LIMITS = (
+    *("range", "stops", "torque range", "force range", "control range", "activation range", "early activation"),
+    *("dynamics", "delay", "yield of the spring", "rest of the spring"),
+)
 """Properties that accelerations show only where a state reaches them."""
+_AT_JOINTS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 
 
 @dataclass(frozen=True)
@@ -84,13 +88,8 @@ def find(frame: Frame, tolerated: float) -> tuple[dict[PlaneElement, Found], dic
             )
         else:
             differ = differences(frame, match)
-            limits = [
-                f"{what} of {printable(frame.name('joint', j))}"
-                for j, one in enumerate(differ)
-                for what in LIMITS
-                if one.shares.get(what, 0.0) > EXACT
-            ]
-            proof = replace(proof, unlike=(*proof.unlike, *unlike_contacts(frame, match, EXACT), *limits))
+            others = *unlike_contacts(frame, match, EXACT), *_unlike_limits(frame, match, differ)
+            proof = replace(proof, unlike=(*proof.unlike, *others))
             found[element] = Found(match, proof, differ, None if frame.base is None else differ[frame.base])
     while lost := _outside(found, idle):
         del found[lost]
@@ -118,11 +117,25 @@ def differences(frame: Frame, match: Match) -> list[Difference]:
     for i, j in enumerate(match.joint.tolist()):
         shares = _of_joint(frame, R, i, j)
         for a in np.flatnonzero(model.actuator_trnid[:, 0] == i):
-            if model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT and match.ctrl[:, a].any():
+            if model.actuator_trntype[a] in _AT_JOINTS:
                 shares |= _of_actuator(frame, match, int(a))
-        what, share = max(shares.items(), key=lambda item: item[1])
-        found.append(Difference(what if share > 1e-9 else "", share, shares))
+        what, most = max(shares.items(), key=lambda item: item[1])
+        found.append(Difference(what if most > 1e-9 else "", most, shares))
     return found
+
+
+def _unlike_limits(frame: Frame, match: Match, differ: list[Difference]) -> list[str]:
+    """Return the limits of joints, actuators and tendons that are not as those of their images."""
+    told = [("joint", j, one.shares) for j, one in enumerate(differ)]
+    pulling = [a for a, kind in enumerate(frame.model.actuator_trntype) if kind not in _AT_JOINTS]
+    told += [("actuator", a, _of_actuator(frame, match, a)) for a in pulling]
+    told += [("tendon", t, _of_tendon(frame, match, t)) for t in range(frame.model.ntendon)]
+    return [
+        f"{what} of {printable(frame.name(kind, k))}"
+        for kind, k, shares in told
+        for what in LIMITS
+        if shares.get(what, 0.0) > EXACT
+    ]
 
 
 def _of_joint(frame: Frame, R: Floats, i: int, j: int) -> dict[str, float]:
@@ -138,25 +151,53 @@ def _of_joint(frame: Frame, R: Floats, i: int, j: int) -> dict[str, float]:
         "friction": share(model.dof_frictionloss[v], model.dof_frictionloss[w]),
         "stiffness": share(model.jnt_stiffness[i], model.jnt_stiffness[j]),
     }
+    limited = model.jnt_limited[[i, j]]
+    stops = [np.r_[model.jnt_solref[k], model.jnt_solimp[k], model.jnt_margin[k]] for k in (i, j)]
+    shares["stops"] = share(*stops) if limited.any() else 0.0
+    if (bends := getattr(model, "jnt_springyield", None)) is not None:  # as MuJoCo has them of late
+        shares["yield of the spring"] = share(bends[i], bends[j])
+    if model.jnt_type[i] == BALL:
+        shares["range"] = share(*model.jnt_range[[i, j]] * limited[:, None])
     if model.jnt_type[i] in (SLIDE, HINGE):
         axis = image_of_axis(frame, R, i)
         sign = np.copysign(1.0, axis @ frame.axis[j])
         shares["axis"] = float(np.linalg.norm(axis - sign * frame.axis[j]))
         limits = [model.jnt_range[k] * model.jnt_limited[k] - model.qpos0[frame.qpos_of(k)] for k in (i, j)]
         shares["range"] = share(np.sort(sign * limits[0]), limits[1])
-        stops = [np.r_[model.jnt_solref[k], model.jnt_solimp[k], model.jnt_margin[k]] for k in (i, j)]
-        shares["stops"] = share(*stops) if model.jnt_limited[i] or model.jnt_limited[j] else 0.0
         torques = [model.jnt_actfrcrange[k] * model.jnt_actfrclimited[k] for k in (i, j)]
         shares["torque range"] = share(np.sort(sign * torques[0]), torques[1])
     return shares
 
 
+def _of_tendon(frame: Frame, match: Match, t: int) -> dict[str, float]:
+    """Return how far limits of a tendon are from those of its image; of one without, from none."""
+    model, image = frame.model, match.tendons[:, t]
+    u, sign = int(np.abs(image).argmax()), image.sum()
+    limited, rest = model.tendon_limited[:, None], model.tendon_length0[:, None]
+    stops = np.column_stack([model.tendon_solref_lim, model.tendon_solimp_lim, model.tendon_margin]) * limited
+    ranges = {
+        "range": (model.tendon_range - rest) * limited,
+        "torque range": model.tendon_actfrcrange * model.tendon_actfrclimited[:, None],
+        "rest of the spring": (model.tendon_lengthspring - rest) * (model.tendon_stiffness != 0)[:, None],
+    }
+    shares = {what: share(np.sort((sign or 1.0) * x[t]), x[u] * abs(sign)) for what, x in ranges.items()}
+    bends = getattr(model, "tendon_springyield", np.zeros(model.ntendon))  # as MuJoCo has them of late
+    return shares | {
+        what: share(x[t], x[u] * abs(sign)) for what, x in (("stops", stops), ("yield of the spring", bends))
+    }
+
+
 def _of_actuator(frame: Frame, match: Match, a: int) -> dict[str, float]:
     model, b = frame.model, int(np.abs(match.ctrl[:, a]).argmax())
-    names = {"gain": "gainprm", "bias": "biasprm", "early activation": "actearly"}
-    values = {what: getattr(model, f"actuator_{name}")[[a, b]] for what, name in names.items()}
+    fixed = (model.actuator_gaintype == 0) & (model.actuator_gainprm[:, 0] < 0)
+    turned = np.where(fixed[a] != fixed[b], -1.0, 1.0)  # a gain of the other sign turns the control, not the force
+    gains = model.actuator_gainprm
+    values = {"gain": [turned * gains[a], gains[b]], "delay": model.actuator_delay[[a, b]]}
+    values |= {"bias": model.actuator_biasprm[[a, b]], "early activation": model.actuator_actearly[[a, b]]}
+    values["dynamics"] = model.actuator_dynprm[[a, b]] * bool(model.actuator_dyntype[a])
     for what, name in (("force range", "force"), ("control range", "ctrl"), ("activation range", "act")):
         limits = getattr(model, f"actuator_{name}range") * getattr(model, f"actuator_{name}limited")[:, None]
-        values[what] = [np.sort(match.ctrl[b, a] * limits[a]), limits[b]]
+        sign = match.ctrl[b, a] * (turned if name == "force" else 1.0)
+        values[what] = [np.sort(sign * limits[a]), limits[b]]
     values["gear"] = np.abs(model.actuator_gear[[a, b]])
     return {what: share(*pair) for what, pair in values.items()}

@@ -5,6 +5,7 @@ import pytest
 
 from esp_cli import Body
 from esp_cli.bodies.proof import Proof
+from esp_envs.errors import UserError
 from tests.bodies.models import biped
 
 FOOT, FREE, FLOOR = 'pos="0.03 0 0"', '<freejoint name="root"/>', '<geom type="plane" size="5 5 1"/>'
@@ -106,3 +107,116 @@ def test_a_wall_has_its_image_about_the_base(free):
     one = changed(FLOOR, FLOOR + wall.format("left", 4), text)
     assert proof_of(one).unlike == ("shape of left",)
     assert proof_of(changed(FLOOR, FLOOR + wall.format("right", -4), one)).verdict == "exact"
+
+
+TENDONS = "".join(f'<fixed name="t_{x}"><joint joint="{x}_roll" coef="1"/></fixed>' for x in ("left", "right"))
+PULLS = '<position name="p_{0}" tendon="t_{0}" kp="9"/><motor name="m_{0}" jointinparent="{0}_roll"/>'
+ARM = """<body name="{0}_arm" pos="0 {1} 0.3"><joint name="{0}_ball" type="ball" range="0 180"/>
+  <geom type="capsule" fromto="0 0 0 0.1 0 0" size="0.02"/><site name="{0}_end"/></body>"""
+SENSORS = "".join(f'<accelerometer name="s_{x}" site="{x}_end"/>' for x in ("left", "right"))
+
+
+def pulled() -> str:
+    """Return a biped with ball joints, tendons, actuators at both, and sensors."""
+    text = biped(extra=ARM.format("left", 0.3) + ARM.format("right", -0.3))
+    text = text.replace("</actuator>", PULLS.format("left") + PULLS.format("right") + "</actuator>")
+    return text.replace("</mujoco>", f"<tendon>{TENDONS}</tendon><sensor>{SENSORS}</sensor></mujoco>")
+
+
+@pytest.mark.parametrize(
+    ("part", "how", "what"),
+    [
+        ('name="left_ball"', 'solreflimit="0.1 1"', "stops of left_ball"),
+        ('type="ball"', 'limited="false"', "range of left_ball"),
+        ('name="left_knee"', 'springyield="50"', "yield of the spring of left_knee"),
+        ('name="p_left"', 'forcerange="-99 99"', "force range of p_left"),
+        ('name="p_left"', 'ctrlrange="-2 2"', "control range of p_left"),
+        ('name="m_left"', 'forcerange="-99 99"', "force range of left_roll"),
+        ('name="t_left"', 'range="-9 9"', "range of t_left"),
+        ('name="t_left"', 'actuatorfrcrange="-99 99"', "torque range of t_left"),
+        ('name="t_left"', 'stiffness="1" springlength="-9 9"', "rest of the spring of t_left"),
+        ('name="t_left"', 'springyield="5"', "yield of the spring of t_left"),
+        ('name="s_left"', 'interval="0.1"', "interval of s_left"),
+        ('name="s_left"', 'noise="1"', "noise of s_left"),
+        ('name="s_left"', 'cutoff="500"', "cutoff of s_left"),
+    ],
+)
+def test_what_only_some_states_or_times_show_is_compared(part, how, what):
+    text = pulled()
+    if "yield" in how and not hasattr(mujoco.MjModel, "jnt_springyield"):
+        pytest.skip("this MuJoCo has no plastic springs")
+    assert proof_of(text).verdict == "exact"
+    proof = proof_of(changed(part, f"{part} {how}", text))
+    assert {what, what.replace("left", "right")} <= set(proof.unlike)
+    assert proof.verdict == "nearly"
+
+
+PAIRS = {
+    "gains": ('<general name="{0}{2}" joint="{1}_roll" gainprm="{3}"/>', (1, 10), [-1, -1]),
+    "stiffness": ('<position name="{0}{2}" joint="{1}_roll" kp="{3}"/>', (5, 50), [-1, -1]),
+    "ranges": ('<motor name="{0}{2}" joint="{1}_pitch" ctrlrange="{3}"/>', ("0 1", "-2 0"), [-1, -1]),
+    "adhesion": ('<adhesion name="{0}{2}" body="{1}_shin" ctrlrange="0 1" gain="{3}"/>', (1, 10), [1, 1]),
+}
+
+
+@pytest.mark.parametrize("what", PAIRS)
+def test_two_actuators_of_one_part_may_stand_in_another_order_on_each_side(what):
+    told, values, signs = PAIRS[what]
+    right = values if what != "ranges" else ("-1 0", "0 2")  # pitch changes its sign
+    own = "".join(told.format("l", "left", k, x) for k, x in enumerate(values))
+    own += "".join(told.format("r", "right", k, x) for k, x in reversed([*enumerate(right)]))
+    found = body_of(changed("</actuator>", own + "</actuator>")).found["flip-x"]
+    assert found.proof.verdict == "exact"
+    # left 0 and 1 go to right 0 and 1, which stand in the other order
+    assert found.match.ctrl[5:, 5:7].T.tolist() == [[0, 0, 0, signs[0]], [0, 0, signs[1], 0]]
+
+
+def test_a_gain_of_the_other_sign_is_matched_by_what_it_does():
+    text = changed('<motor name="a_left_knee" joint="left_knee"/>', '<general joint="left_knee" gainprm="-1"/>')
+    found = body_of(text).found["flip-x"]
+    assert (found.proof.verdict, found.match.ctrl[4, 3]) == ("exact", -1)
+
+
+def test_time_constants_that_are_nearly_alike_are_nearly_a_mirror():
+    slow = '<general joint="{}_roll" dyntype="filter" dynprm="{}"/>'
+    text = changed("</actuator>", slow.format("left", 0.05) + slow.format("right", 0.0501) + "</actuator>")
+    assert proof_of(text).unlike == ("dynamics of left_roll", "dynamics of right_roll")
+
+
+def test_tendons_that_pull_at_nothing_at_rest_have_their_images():
+    ends = '<site name="{0}_{1}" pos="0 {2} {3}"/>'
+    text = biped(extra=ends.format("left", "hip", 0.1, 0.2) + ends.format("right", "hip", -0.1, 0.2))
+    for side in ("left", "right"):  # through the axis of the roll
+        text = text.replace(
+            f'<body name="{side}_shin"', ends.format(side, "end", 0, -0.3) + f'<body name="{side}_shin"'
+        )
+        strand = f'<spatial name="{side}"><site site="{side}_hip"/><site site="{side}_end"/></spatial>'
+        text = text.replace("</mujoco>", f"<tendon>{strand}</tendon></mujoco>")
+    pull = '<motor tendon="left"/><motor tendon="right"/></actuator>'
+    found = body_of(text.replace("0.02 0.1 -0.1", "0 0.1 -0.1").replace("0.02 -0.1 -0.1", "0 -0.1 -0.1")
+                    .replace("</actuator>", pull)).found["flip-x"]  # fmt: skip
+    assert found.match.ctrl[5:, 5:].tolist() == [[0, 1], [1, 0]]
+
+
+def test_an_actuator_that_never_pulls_is_not_covered():
+    text = changed("</actuator>", '<motor name="loose" joint="left_roll" gear="0"/></actuator>')
+    refused = body_of(text).refused["flip-x"]
+    assert refused == "not covered: in no pose that was looked at does anything pull of the actuators loose"
+
+
+@pytest.mark.parametrize("order", [("sole", "imu"), ("imu", "sole")])
+def test_frames_at_one_place_go_to_those_of_like_names(order):
+    text = biped()
+    for side, names in (("left", ("sole", "imu")), ("right", order)):
+        frames = "".join(f'<body name="{side}_{name}" pos="0 0 -0.1"/>' for name in names)
+        text = text.replace(f'<joint name="{side}_yaw"', f'{frames}<joint name="{side}_yaw"')
+    body = body_of(text)
+    for name in ("sole", "imu"):
+        assert body.contacts([f"left_{name}", f"right_{name}"])
+
+
+def test_a_base_beside_the_origin_has_no_state():
+    assert body_of(biped()).state()
+    assert body_of(changed('pos="0 0 1"', 'pos="3 0 1"')).state(), "flip-x leaves x"
+    with pytest.raises(UserError, match="the base does not begin over the origin, so its state has no layout"):
+        body_of(changed('pos="0 0 1"', 'pos="0 2 1"')).state()
