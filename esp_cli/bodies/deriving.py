@@ -6,7 +6,7 @@ joints and by where their mass is. What a match means for positions, velocities 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher
 from functools import cache, partial
@@ -16,8 +16,9 @@ import mujoco
 import numpy as np
 from scipy.linalg import block_diag
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import cdist
 
-from esp_cli.bodies.frame import BALL, FREE, HINGE, SLIDE, Frame, clean, image_of_axis
+from esp_cli.bodies.frame import BALL, FREE, HINGE, SLIDE, Frame, clean, image_of_axis, share
 from esp_cli.bodies.reading import printable
 from esp_cli.symmetry.elements import Floats, Indices
 from esp_cli.symmetry.plane import PlaneElement
@@ -185,7 +186,7 @@ def _pulled_maps(
     mujoco.mj_integratePos(model, other, 0.3 * np.random.default_rng(0).normal(size=model.nv), 1.0)
     here = np.hstack([_pulls(frame, q) @ qvel.T for q in (rest, other)])
     there = np.hstack([_pulls(frame, qpos @ q + offset) for q in (rest, other)])
-    tendons = _images(here[model.nu :], there[model.nu :], np.zeros((2, 1, 1)))
+    tendons = _images(here[model.nu :], there[model.nu :], lambda *_: 0.0)
     on_body = model.actuator_trntype == mujoco.mjtTrn.mjTRN_BODY  # pulls where it touches, as adhesion does
     held = np.eye(model.nbody)[model.actuator_trnid[:, 0] * on_body] * on_body[:, None]
     if idle := [a for a in range(model.nu) if not (on_body[a] or np.abs(here[a]).max() > 1e-9)]:
@@ -193,54 +194,51 @@ def _pulled_maps(
         raise UserError(f"not covered: in no pose that was looked at does anything pull of the actuators {names}")
     turned = np.where((model.actuator_gaintype == 0) & (model.actuator_gainprm[:, 0] < 0), -1.0, 1.0)[:, None]
     here, there = (turned * x[: model.nu] * ~on_body[:, None] for x in (here, there))
-    ctrl = _images(np.hstack([here, held @ bodies.T]), np.hstack([there, held]), _unlike_actuators(model))
+    ctrl = _images(np.hstack([here, held @ bodies.T]), np.hstack([there, held]), partial(_unlike_actuators, model))
     lost = np.flatnonzero(~ctrl.any(0)).tolist()
     return ctrl, tendons, tuple(printable(frame.name("actuator", a)) for a in lost)
 
 
-def _images(here: Floats, there: Floats, unlike: Floats) -> Floats:
-    """Return the signed map [n, n] of what pulls: image `here` [n, k] to `there`; `unlike` [2, n, n] adds to its cost.
-
-    Its first part is of images that pull, its second of those that are pushed where their original is pulled.
-    """
+def _images(here: Floats, there: Floats, unlike: Callable[[int, int, float], float]) -> Floats:
+    """Return the signed map [n, n] of what pulls, image `here` [n, k] to `there`; `unlike` adds to a pair's cost."""
     scales = [np.abs(x).max(axis=1, initial=0) for x in (here, there)]
     unit, other = (
         x / np.where(size > 1e-9, size, np.inf)[:, None] for x, size in zip((here, there), scales, strict=True)
     )
-    gaps = np.abs(unit[:, None] - np.stack([other, -other])[:, None]).max(-1, initial=0) + unlike
+    gaps = np.stack([cdist(unit, x, "chebyshev") for x in (other, -other)])
     gaps += 0.1 * np.abs(np.subtract.outer(*scales)) / max(scales[0].max(initial=0), 1e-12)
     gaps[1] += 1e-9  # two that pull one joint opposite ways: each has an image of its own sense
-    found, pulling = np.zeros((len(here),) * 2), np.flatnonzero(unit.any(1))
-    gap = gaps.min(0)[pulling]
-    for i, b in zip(*linear_sum_assignment(gap), strict=True):
-        if gap[i, b] <= 3 * LOOSE:
-            found[b, pulling[i]] = 1.0 if gaps[0, pulling[i], b] <= gaps[1, pulling[i], b] else -1.0
+    for back, a, b in np.argwhere(gaps <= 3 * LOOSE):
+        gaps[back, a, b] += unlike(a, b, -1.0 if back else 1.0)
+    found, gap = np.zeros((len(here),) * 2), gaps.min(0)
+    for a, b in zip(*linear_sum_assignment(gap), strict=True):
+        if gap[a, b] <= 3 * LOOSE:
+            found[b, a] = 1.0 if gaps[0, a, b] <= gaps[1, a, b] else -1.0
     return found
 
 
-def _unlike_actuators(model: Any) -> Floats:
-    """Return how unlike actuators are, [2, nu, nu]: as they are, and with the control of the second reversed."""
-
-    def apart(x: Floats, y: Floats) -> Floats:
-        largest = np.maximum.outer(np.abs(x).max(-1), np.abs(y).max(-1))
-        return np.abs(x[:, None] - y).max(-1) / np.maximum(largest, 1e-12)
-
-    dynamic = (model.actuator_dyntype != 0)[:, None]
+def _unlike_actuators(model: Any, a: int, b: int, sign: float) -> float:
     types = np.column_stack([getattr(model, f"actuator_{of}type") for of in ("gain", "bias", "dyn")])
-    ranges = [
-        getattr(model, f"actuator_{of}range") * getattr(model, f"actuator_{of}limited")[:, None]
-        for of in ("ctrl", "force", "act")
-    ]
-    slow = [apart(x, x) for x in (model.actuator_dynprm * dynamic, model.actuator_delay[:, None])]
-    alike = [apart(x, x) for x in (np.abs(model.actuator_gainprm), model.actuator_biasprm)]
-    gap = _UNLIKE * sum([*slow, *alike]) + _APART * (types[:, None] != types).any(-1)
-    gap += _APART * sum(x > _SLOWER for x in slow)
-    return np.stack(
-        [
-            gap + _UNLIKE * sum(apart(x, y) for x, y in zip(ranges, other, strict=True))
-            for other in (ranges, [-x[:, ::-1] for x in ranges])
-        ]
-    )
+    shares = actuator_shares(model, a, b, sign)
+    if (types[a] != types[b]).any() or max(shares["dynamics"], shares["delay"]) > _SLOWER:
+        return _APART
+    return _UNLIKE * sum(shares.values())
+
+
+def actuator_shares(model: Any, a: int, b: int, sign: float) -> dict[str, float]:
+    """Return by property how far actuator b is from the image of a, whose control it takes with a sign."""
+    gains = model.actuator_gainprm
+    # a gain of the other sign turns the control, not the force
+    turned = -1.0 if (gains[a, 0] * gains[b, 0] < 0) and model.actuator_gaintype[a] == 0 else 1.0
+    values = {"gain": [turned * gains[a], gains[b]], "dynamics": model.actuator_dynprm[[a, b]]}
+    values["dynamics"] = values["dynamics"] * bool(model.actuator_dyntype[a])
+    for what, name in (("bias", "biasprm"), ("early activation", "actearly"), ("delay", "delay")):
+        values[what] = getattr(model, f"actuator_{name}")[[a, b]]
+    for what, name in (("force range", "force"), ("control range", "ctrl"), ("activation range", "act")):
+        limits = getattr(model, f"actuator_{name}range") * getattr(model, f"actuator_{name}limited")[:, None]
+        values[what] = [np.sort(sign * (turned if name == "force" else 1.0) * limits[a]), limits[b]]
+    values["gear"] = np.abs(model.actuator_gear[[a, b]])
+    return {what: share(*pair) for what, pair in values.items()}
 
 
 def _all_bodies(frame: Frame, R: Floats, moved: dict[int, int]) -> Floats:

@@ -9,7 +9,7 @@ from fractions import Fraction
 import mujoco
 import numpy as np
 
-from esp_cli.bodies.deriving import Match, derive
+from esp_cli.bodies.deriving import Match, actuator_shares, derive
 from esp_cli.bodies.frame import BALL, HINGE, SLIDE, Frame, image_of_axis, share
 from esp_cli.bodies.proof import EXACT, Proof, prove
 from esp_cli.bodies.reading import printable
@@ -31,7 +31,7 @@ TRIED = tuple(
 
 LIMITS = (
     *("range", "stops", "torque range", "force range", "control range", "activation range", "early activation"),
-    *("dynamics", "delay", "yield of the spring", "rest of the spring"),
+    *("dynamics", "delay", "springyield", "limits or spring"),
 )
 """Properties that accelerations show only where a state reaches them."""
 _AT_JOINTS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
@@ -154,8 +154,7 @@ def _of_joint(frame: Frame, R: Floats, i: int, j: int) -> dict[str, float]:
     limited = model.jnt_limited[[i, j]]
     stops = [np.r_[model.jnt_solref[k], model.jnt_solimp[k], model.jnt_margin[k]] for k in (i, j)]
     shares["stops"] = share(*stops) if limited.any() else 0.0
-    if (bends := getattr(model, "jnt_springyield", None)) is not None:  # as MuJoCo has them of late
-        shares["yield of the spring"] = share(bends[i], bends[j])
+    shares |= {what: share(x[i], x[j]) for what, x in frame.properties("jnt", "springyield").items()}
     if model.jnt_type[i] == BALL:
         shares["range"] = share(*model.jnt_range[[i, j]] * limited[:, None])
     if model.jnt_type[i] in (SLIDE, HINGE):
@@ -170,34 +169,24 @@ def _of_joint(frame: Frame, R: Floats, i: int, j: int) -> dict[str, float]:
 
 
 def _of_tendon(frame: Frame, match: Match, t: int) -> dict[str, float]:
-    """Return how far limits of a tendon are from those of its image; of one without, from none."""
-    model, image = frame.model, match.tendons[:, t]
-    u, sign = int(np.abs(image).argmax()), image.sum()
-    limited, rest = model.tendon_limited[:, None], model.tendon_length0[:, None]
-    stops = np.column_stack([model.tendon_solref_lim, model.tendon_solimp_lim, model.tendon_margin]) * limited
-    ranges = {
-        "range": (model.tendon_range - rest) * limited,
-        "torque range": model.tendon_actfrcrange * model.tendon_actfrclimited[:, None],
-        "rest of the spring": (model.tendon_lengthspring - rest) * (model.tendon_stiffness != 0)[:, None],
-    }
-    shares = {what: share(np.sort((sign or 1.0) * x[t]), x[u] * abs(sign)) for what, x in ranges.items()}
-    bends = getattr(model, "tendon_springyield", np.zeros(model.ntendon))  # as MuJoCo has them of late
-    return shares | {
-        what: share(x[t], x[u] * abs(sign)) for what, x in (("stops", stops), ("yield of the spring", bends))
-    }
+    """Return how far limits and spring of a tendon are from those of its image; of one without, from none."""
+    model, image, rest = frame.model, match.tendons[:, t], frame.model.tendon_length0[:, None]
+    u, sign, limited = int(np.abs(image).argmax()), image.sum(), model.tendon_limited[:, None]
+    ranges = [
+        (model.tendon_range - rest) * limited,
+        (model.tendon_lengthspring - rest) * (model.tendon_stiffness != 0)[:, None],
+        model.tendon_actfrcrange * model.tendon_actfrclimited[:, None],
+    ]
+    stops = [
+        model.tendon_solref_lim * limited,
+        model.tendon_solimp_lim * limited,
+        model.tendon_margin[:, None] * limited,
+    ]
+    stops += frame.properties("tendon", "springyield").values()
+    shares = [share(np.sort((sign or 1.0) * x[t]), x[u] * abs(sign)) for x in ranges]
+    return {"limits or spring": max(*shares, *(share(x[t], x[u] * abs(sign)) for x in stops))}
 
 
 def _of_actuator(frame: Frame, match: Match, a: int) -> dict[str, float]:
-    model, b = frame.model, int(np.abs(match.ctrl[:, a]).argmax())
-    fixed = (model.actuator_gaintype == 0) & (model.actuator_gainprm[:, 0] < 0)
-    turned = np.where(fixed[a] != fixed[b], -1.0, 1.0)  # a gain of the other sign turns the control, not the force
-    gains = model.actuator_gainprm
-    values = {"gain": [turned * gains[a], gains[b]], "delay": model.actuator_delay[[a, b]]}
-    values |= {"bias": model.actuator_biasprm[[a, b]], "early activation": model.actuator_actearly[[a, b]]}
-    values["dynamics"] = model.actuator_dynprm[[a, b]] * bool(model.actuator_dyntype[a])
-    for what, name in (("force range", "force"), ("control range", "ctrl"), ("activation range", "act")):
-        limits = getattr(model, f"actuator_{name}range") * getattr(model, f"actuator_{name}limited")[:, None]
-        sign = match.ctrl[b, a] * (turned if name == "force" else 1.0)
-        values[what] = [np.sort(sign * limits[a]), limits[b]]
-    values["gear"] = np.abs(model.actuator_gear[[a, b]])
-    return {what: share(*pair) for what, pair in values.items()}
+    b = int(np.abs(match.ctrl[:, a]).argmax())
+    return actuator_shares(frame.model, a, b, match.ctrl[b, a])

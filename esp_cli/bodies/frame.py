@@ -70,6 +70,10 @@ class Frame:
         """Return the name of a body, joint or actuator, made of its number where it has none."""
         return str(getattr(self.model, kind)(index).name) or f"{kind}#{index}"
 
+    def properties(self, of: str, *names: str) -> dict[str, Any]:
+        """Return arrays of the model that this MuJoCo knows, by name: of="geom", "friction"."""
+        return {name: getattr(self.model, f"{of}_{name}") for name in names if hasattr(self.model, f"{of}_{name}")}
+
     def carrier(self, body: int) -> int:
         """Return the moving body that a body hangs on; 0 is the world."""
         return int(self.model.body_weldid[self.model.body_parentid[body]])

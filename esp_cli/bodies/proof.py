@@ -22,7 +22,6 @@ EXACT, NEARLY = 1e-5, 0.05  # largest gap of a mirror exact up to rounding, and 
 SEEN = 3.0  # how many times the gap of a planted mistake exceeds the gap without it, where the proof would have seen it
 NO_MIRROR = (mujoco.mjtSensor.mjSENS_USER, mujoco.mjtSensor.mjSENS_PLUGIN)
 """Kinds of sensors of which nobody knows what their readings mean."""
-_OF_A_SENSOR = ("interval", "delay", "noise", "cutoff")  # of which a MuJoCo may know some alone
 _STATES, _LYING, _PLANTED = 48, 24, 12  # states that are compared, that are laid on the floor, and for each mistake
 _NO_CONSTRAINTS, _NO_SENSORS, _NO_CONTACTS = (
     int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in ("CONSTRAINT", "SENSOR", "CONTACT")
@@ -141,7 +140,7 @@ def prove(frame: Frame, match: Match, seed: int = 0) -> Proof:
     held = [_gaps(frame, match, *pair)[1] for pair in pairs]
     median, *medians = (float(np.median(gaps)) for gaps in (free, *held))
     worst = float(np.concatenate(held).max())
-    sensors, unjudged, unlike = _sensors(frame.model, here, there)
+    sensors, unjudged, unlike = _sensors(frame, here, there)
     unmet = ("contacts with the world (not covered: no state has any)",)
     unlike += unmet * (frame.base is not None and 0 in frame.shapes and not lying)
     lain = medians[2] if lying else None
@@ -217,13 +216,13 @@ def _gaps(frame: Frame, match: Match, here: Floats, there: Floats) -> tuple[Floa
     return joints, np.sqrt(wrong.sum(1) / np.maximum(size.sum(1), 1e-24))
 
 
-def _sensors(model: Any, here: Floats, there: Floats) -> tuple[dict[str, float], tuple[str, ...], tuple[str, ...]]:
+def _sensors(frame: Frame, here: Floats, there: Floats) -> tuple[dict[str, float], tuple[str, ...], tuple[str, ...]]:
     """Return the gap of each sensor by its name, the kinds that are not judged, and what is unlike; see `Proof`."""
-    alike: dict[tuple[int, int], list[int]] = {}
+    model, alike = frame.model, dict[tuple[int, int], list[int]]()
     for s, (kind, width) in enumerate(zip(model.sensor_type.tolist(), model.sensor_dim.tolist(), strict=True)):
         alike.setdefault((kind, width), []).append(s)
     found, unjudged, unlike = dict[str, float](), set[str](), list[str]()
-    how = {what: getattr(model, f"sensor_{what}") for what in _OF_A_SENSOR if hasattr(model, f"sensor_{what}")}
+    how = frame.properties("sensor", "interval", "delay", "noise", "cutoff")
     for (kind, width), some in alike.items():
         index = model.nv + model.sensor_adr[some][:, None] + np.arange(width)
         # readings [sensors, states, width] are compared up to where their zero is

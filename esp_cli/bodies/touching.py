@@ -17,7 +17,7 @@ _OF_A_PAIR = ("friction", "solref", "solimp", "margin", "gap", "dim", "solreffri
 def shape_images(frame: Frame, R: Floats, b: int, c: int) -> list[tuple[int, int, float]]:
     """Return each shape of a moving body that may touch something, its image on another (-1: none), and their gap."""
     own, other = frame.shapes.get(b, []), frame.shapes.get(c, [])
-    contacts = _properties(frame, "geom", _OF_A_GEOM)
+    contacts = frame.properties("geom", *_OF_A_GEOM)
     table = np.ones((len(own), len(other)))
     for row, (g, kind, place, spread) in zip(table, own, strict=True):
         for k, (h, like, there, extent) in enumerate(other):
@@ -37,7 +37,7 @@ def unlike_contacts(frame: Frame, match: Match, wrong: float) -> tuple[str, ...]
     model, image = frame.model, np.where(match.bodies.any(0), match.bodies.argmax(0), -1)
     image[0] = 0
     may, geoms, found = frame.touching, np.full(frame.model.ngeom, -1), list[str]()
-    contacts = _properties(frame, "geom", _OF_A_GEOM)
+    contacts = frame.properties("geom", *_OF_A_GEOM)
     for b in frame.shapes:
         for g, h, gap in shape_images(frame, match.world, b, int(image[b])):
             geoms[g] = h
@@ -49,18 +49,12 @@ def unlike_contacts(frame: Frame, match: Match, wrong: float) -> tuple[str, ...]
     known = [b for b in range(model.nbody) if image[b] >= 0]
     lost = [(b, c) for b in known for c in known if b < c and bodies[b, c] and not bodies[image[b], image[c]]]
     found += ["contact of " + " and ".join(printable(frame.name("body", b)) for b in pair) for pair in lost]
-    told = _properties(frame, "pair", _OF_A_PAIR)
     pairs = {frozenset(pair): k for k, pair in enumerate(zip(model.pair_geom1, model.pair_geom2, strict=True))}
     for pair, k in pairs.items():
         other = pairs.get(frozenset(geoms[list(pair)]))
-        if other is None or any(share(x[k], x[other]) > wrong for x in told.values()):
+        if other is None or any(share(x[k], x[other]) > wrong for x in frame.properties("pair", *_OF_A_PAIR).values()):
             found.append("contact pair of " + " and ".join(_name(frame, g) for g in sorted(pair)))
     return tuple(found)
-
-
-def _properties(frame: Frame, of: str, names: tuple[str, ...]) -> dict[str, Floats]:
-    """Return by name the properties [count, ...] of geoms or pairs that this MuJoCo knows."""
-    return {what: values for what in names if (values := getattr(frame.model, f"{of}_{what}", None)) is not None}
 
 
 def _name(frame: Frame, geom: int) -> str:
