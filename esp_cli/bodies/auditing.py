@@ -29,6 +29,7 @@ class Copy:
 
     element: str  # the element that it comes nearest to; "identity" of the first
     is_involution: bool  # whether it undoes itself, as a mirror does
+    unseen: tuple[str, ...]  # groups of observations, or "action", that the function neither takes nor returns
     wrong: tuple[tuple[str, str, str], ...]  # number, what it takes, what is right: ("action.hip", "hip", "-hip")
 
 
@@ -44,6 +45,7 @@ def audit(function: Callable[..., Any], body: Body, numbers: Numbers) -> list[Co
     for name, layout in numbers.items():
         rows[name] = torch.eye(count)[:, : layout.width]
         rows[name][-_RANDOM:] = torch.randn((_RANDOM, layout.width), generator=noise)
+        rows[name][-_RANDOM // 2 :] *= 100  # a function may act otherwise on large numbers
     maps: dict[str, list[Floats]] = {}
     for name, made in _called(function, numbers, rows).items():
         width = numbers[name].width
@@ -80,7 +82,7 @@ def _judged(maps: dict[str, Floats], wanted: dict[str, dict[str, Floats]], numbe
         right = wanted[nearest][name]
         wrong += [(labels[k], _words(made[k], labels), _words(right[k], labels)) for k in off(nearest, name)]
     involution = all(np.abs(made @ made - np.eye(len(made))).max() < _TOLERANCE for made in maps.values())
-    return Copy(nearest, involution, tuple(wrong))
+    return Copy(nearest, involution, tuple(name for name in numbers if name not in maps), tuple(wrong))
 
 
 def _words(row: Floats, labels: list[str]) -> str:

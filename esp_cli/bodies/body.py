@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, SupportsFloat
 
+import mujoco
 import numpy as np
 
 from esp_cli.bodies import kinds
@@ -13,7 +14,7 @@ from esp_cli.bodies.finding import Difference, Found, find
 from esp_cli.bodies.frame import Frame
 from esp_cli.bodies.kinds import Parts, named_parts
 from esp_cli.bodies.proof import NEARLY
-from esp_cli.bodies.reading import MOST_BODIES, MOST_MOVING, printable, quiet, read_model
+from esp_cli.bodies.reading import MOST_BODIES, MOST_MOVING, is_urdf, printable, quiet, read_model
 from esp_cli.symmetry.elements import Floats
 from esp_cli.symmetry.parse import parse_elements
 from esp_cli.symmetry.plane import PlaneElement
@@ -59,7 +60,7 @@ class Body:
         mirror: Mapping[str, str] | Mapping[str, Mapping[str, str]],
         limbs: Mapping[str, str] | Mapping[str, Mapping[str, str]] | None = None,
     ) -> None:
-        named = named_parts("joints", list(joints), mirror)
+        named = named_parts("joints", joints, mirror)
         pairs = [(k, v) for k, v in (limbs or {}).items() if isinstance(v, str)]
         pairs += [pair for table in (limbs or {}).values() if not isinstance(table, str) for pair in table.items()]
         ends = list(dict.fromkeys(name for pair in pairs for name in pair))
@@ -95,7 +96,10 @@ class Body:
         Raises:
             UserError: the file cannot be read, or nothing of the model moves.
         """
-        return cls._from_model(read_model(model, root) if isinstance(model, str | Path) else model, tolerated, seconds)
+        model = read_model(model, root) if isinstance(model, str | Path) else model
+        if not isinstance(model, mujoco.MjModel):
+            raise UserError(f"a model is given as {type(model).__name__}; give the path of a file, or a mujoco.MjModel")
+        return cls._from_model(model, tolerated, seconds)
 
     @classmethod
     def from_urdf(
@@ -107,7 +111,10 @@ class Body:
         seconds: float = SECONDS,
     ) -> Body:
         """Find and prove the symmetries of a URDF file; its first link moves freely unless `floating` is false."""
-        return cls._from_model(read_model(path, root, floating), tolerated, seconds)
+        model = read_model(path, root, floating)
+        if not is_urdf(path):
+            raise UserError(f"{path} is MJCF, not URDF; read it with Body.from_mjcf")
+        return cls._from_model(model, tolerated, seconds)
 
     @classmethod
     @quiet()
@@ -276,7 +283,7 @@ class Body:
         for element, matrix in self._velocities.moves.items():
             angles = np.zeros(len(matrix))
             for joint, angle in pose.items():
-                if joint not in places or not np.isfinite(angle):
+                if joint not in places or not isinstance(angle, SupportsFloat) or not np.isfinite(angle):
                     raise UserError(f"the pose has {printable(joint)} at {angle}; give joints of it finite angles")
                 angles[places[joint]] = angle
             off = np.abs(matrix @ angles - angles)

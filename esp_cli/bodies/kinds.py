@@ -6,7 +6,8 @@ turns alike, since body and surroundings are mirrored together.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -95,6 +96,8 @@ def parts_field(name: str, what: str, parts: Sequence[str], moves: Mapping[Plane
     """Return a field of `count` items, each the numbers of all parts."""
     if not parts:
         raise UserError(f"field '{name}' has no {what}; name some")
+    if count == 0:
+        raise UserError(f"field '{name}' has a history of 0 steps; give 1 or more")
     rows = tuple((element, tuple(map(tuple, matrix.tolist()))) for element, matrix in moves.items())
     return Field(name, PartsKind(what, len(parts), parts=tuple(parts), moves=rows), count)
 
@@ -113,7 +116,10 @@ def points_field(
     Raises:
         UserError: a point's image is no point.
     """
-    places = np.asarray(points, dtype=np.float64)
+    try:
+        places = np.asarray(points, dtype=np.float64)
+    except (TypeError, ValueError):
+        places = np.zeros(0)
     if places.ndim != 2 or places.shape[1] not in (2, 3) or not len(places) or not np.isfinite(places).all():
         raise UserError(f"field '{name}': points have shape {list(places.shape)}; give [n, 2] or [n, 3] finite numbers")
     size, moves = max(np.abs(places).max(), 1e-9), {}
@@ -132,8 +138,11 @@ def grid(size: tuple[float, float], resolution: float, ordering: str = "xy") -> 
 
     Points are `resolution` m apart; "xy" lets x run fastest, "yx" y. Another ordering, or no point, is a UserError.
     """
-    if ordering not in ("xy", "yx") or resolution <= 0 or min(size) < 0:
-        raise UserError(f"grid({size}, {resolution}, {ordering!r}) is none; give sizes, a resolution and 'xy' or 'yx'")
+    fits = len(size) == 2 and 0 < resolution < np.inf and np.isfinite(size).all() and min(size) >= 0
+    if ordering not in ("xy", "yx") or not fits:
+        raise UserError(
+            f"grid({size}, {resolution}, {ordering!r}) is none; give two sizes, a resolution and 'xy' or 'yx'"
+        )
     if any(abs(s / resolution - round(s / resolution)) > 1e-6 for s in size):
         raise UserError(f"grid({size}, {resolution}): no mirror keeps points that miss the edge; give multiples of it")
     x, y = (np.linspace(-s / 2, s / 2, round(s / resolution) + 1) for s in size)
@@ -151,11 +160,12 @@ class Parts:
 
     def field(self, name: str, names: Sequence[str], history: int, width: int = 1) -> Field:
         """Return a field of some parts, in this order, each with `width` numbers; their images must be among them."""
+        names = _listed(f"field '{name}'", names)
         if unknown := next((n for n in names if n not in self.places), None):
             known = ", ".join(map(printable, list(self.places)[:8])) + (", ..." if len(self.places) > 8 else "")
             raise UserError(f"field '{name}': there is no {printable(unknown)} among the {self.what} {known}")
-        if twice := next((n for k, n in enumerate(names) if n in names[:k]), None):
-            raise UserError(f"field '{name}' names {printable(twice)} twice; name it once")
+        if width < 1:
+            raise UserError(f"field '{name}' has {width} numbers of each; give a width of 1 or more")
         spans = [np.r_[self.places[n]] for n in names]
         owner = [printable(n) for n, span in zip(names, spans, strict=True) for _ in span]
         index, moves = np.concatenate(spans) if spans else np.zeros(0, int), {}
@@ -176,6 +186,9 @@ def named_parts(what: str, names: Sequence[str], tables: Mapping[str, Any]) -> P
 
     A table, or one by element, holds by part its image, with "-" where the sign changes, or follows from its partner.
     """
+    names = _listed(f"the list of {what}", names)
+    if not isinstance(tables, Mapping):
+        raise UserError(f"the mirror is {tables!r}; give a table of the {what}: {{'left': 'right'}}")
     if tables and all(isinstance(value, str) for value in tables.values()):
         tables = {"left-right": tables}
     generators = {_element_of(word): _matrix(what, names, table) for word, table in tables.items()}
@@ -191,6 +204,15 @@ def named_parts(what: str, names: Sequence[str], tables: Mapping[str, Any]) -> P
     return Parts(what, {name: slice(i, i + 1) for i, name in enumerate(names)}, moves)
 
 
+def _listed(who: str, names: Sequence[str]) -> list[str]:
+    """Return names as a list, which is refused where one is no text or stands twice."""
+    if isinstance(names, str) or not isinstance(names, Iterable) or not all(isinstance(n, str) for n in names):
+        raise UserError(f"{who} is given {names!r}; give a list of names")
+    if twice := next((n for n, times in Counter(names).items() if times > 1), None):
+        raise UserError(f"{who} names {printable(twice)} twice; name it once")
+    return list(names)
+
+
 def _element_of(word: str) -> PlaneElement:
     """Return the element of a robot's word, "left-right", or of the plane's, "flip-x"."""
     found = parse_elements(word, 1)
@@ -201,6 +223,8 @@ def _element_of(word: str) -> PlaneElement:
 
 def _matrix(what: str, names: Sequence[str], table: Mapping[str, str]) -> Floats:
     """Return the signed permutation of a table, completed by the partners of those that it names."""
+    if not isinstance(table, Mapping) or not all(isinstance(n, str) for pair in table.items() for n in pair):
+        raise UserError(f"the mirror of the {what} is {table!r}; give by name the name of its image")
     images = dict(table)
     for part, image in table.items():
         target = image.removeprefix("-")

@@ -46,6 +46,8 @@ def read_model(path: Path | str, root: Path | str | None = None, floating: bool 
     path = Path(path)
     if not path.is_file():
         raise UserError(f"there is no model file {path}; give an MJCF or URDF file")
+    if root is not None and not Path(root).is_dir():
+        raise UserError(f"there is no folder {root}; name the one that holds all files of the model as root (--root)")
     tag = _inspected(path, (path.parent if root is None else Path(root)).resolve())
     with quiet():
         try:
@@ -66,6 +68,11 @@ def read_model(path: Path | str, root: Path | str | None = None, floating: bool 
                 light_one = printable(light[1]) if light[1] else "a body"
                 words = f"{light_one} moves but has no mass or inertia; give it an <inertial>"
             raise UserError(f"MuJoCo cannot read {printable(str(path))}: {words[:300]}") from None
+
+
+def is_urdf(path: Path | str) -> bool:
+    """Return whether a file that can be read is URDF."""
+    return _parsed(Path(path)).tag == "robot"
 
 
 @contextmanager

@@ -144,6 +144,8 @@ def _print_audit(name: str, copies: Sequence[Copy]) -> None:
         console.say(f"{name} is right: its copies are {', '.join(elements)}")
         if again := [f"{element} {count} times" for element, count in Counter(elements).items() if count > 1]:
             console.say(f"but it returns {', '.join(again)}; once is enough")
+        if copies[0].unseen:
+            console.say(f"not compared: {', '.join(copies[0].unseen)}, of which it makes no copies")
         return
     console.say(f"{name} is wrong in {len(wrong)} numbers")
     for k, copy in enumerate(copies):

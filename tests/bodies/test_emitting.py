@@ -161,6 +161,18 @@ def test_the_audit_names_what_is_wrong_and_what_is_right():
     assert len(copy.wrong) == 4
 
 
+def test_the_audit_says_what_it_did_not_see(body, tmp_path):
+    mirrored = imported(emitted(body, numbers_of(body, None), "biped"), tmp_path).mirrored
+
+    def right(obs):
+        return torch.cat([obs, mirrored(obs, "flip-x", "policy")])
+
+    (_, copy) = audit(right, body, numbers_of(body, None))
+    assert (copy.element, copy.wrong, copy.unseen) == ("flip-x", (), ("action",))
+    with pytest.raises(UserError, match="not a linear map"):  # it is right for small numbers alone
+        audit(lambda obs: right(obs).clamp(-9, 9), body, numbers_of(body, None))
+
+
 def test_hundreds_of_wrong_mirrors_are_caught_and_relabelled_right_ones_never(tmp_path, monkeypatch):
     mirrors = Mirrors(tmp_path, 0)
     assert [mirrors.run(number) for number in range(27)] == [None] * 27
@@ -233,6 +245,13 @@ def test_the_command_writes_audits_and_refuses(tmp_path, monkeypatch):
     assert esp("check", "mirror", "my_again:again", "biped.xml").stdout == (
         "my_again:again is right: its copies are identity, flip-x, flip-x\n"
         "but it returns flip-x 2 times; once is enough\n"
+    )
+    Path("my_half.py").write_text(
+        "from my_mirror import compute_symmetric_states\n"
+        "def half(actions):\n    return compute_symmetric_states(None, None, actions)[1]\n"
+    )
+    assert esp("check", "mirror", "my_half:half", "biped.xml").stdout.endswith(
+        "not compared: policy, of which it makes no copies\n"
     )
     proof = [sys.executable, "-I", "test_my_mirror.py"]
     assert subprocess.run(proof, capture_output=True, text=True, check=True).stdout == "proven\n"

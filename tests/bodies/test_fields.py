@@ -149,6 +149,13 @@ def test_joints_come_in_the_simulators_order():
         (lambda b: b.contacts(["paw"]), "there is no paw among the limbs"),
         (lambda b: b.scan([[1, 0.5], [1, 0]]), "the image of point 0 under flip-x is no point"),
         (lambda b: b.scan([]), "points have shape"),
+        (lambda b: b.scan("x"), "points have shape"),
+        (lambda b: b.positions("left_knee"), "field 'positions' is given 'left_knee'; give a list of names"),
+        (lambda b: b.positions(history=0), "has a history of 0 steps; give 1 or more"),
+        (lambda b: b.contacts(["left_foot", "right_foot"], width=0), "has 0 numbers of each; give a width of 1"),
+        (lambda b: b.check_pose({"left_knee": "x"}), "the pose has left_knee at x; give joints"),
+        (lambda b: grid((1.0,), 0.1), "give two sizes"),
+        (lambda b: grid((1, 1), np.nan), "give two sizes"),
         (lambda b: b.check_pose({"left_knee": 0.3}), "left_knee is off by 0.3"),
         (lambda b: b.check_pose({"knee": 0.3}), "the pose has knee at 0.3; give joints"),
         (lambda b: b.check_pose({"left_knee": np.nan, "right_knee": np.nan}), "the pose has left_knee at nan"),
@@ -176,6 +183,21 @@ def test_fields_that_do_not_fit_are_refused(make, words):
 def test_tables_that_are_no_symmetry_are_refused(mirror, words):
     with pytest.raises(UserError, match=words):
         Body(["a", "b", "c"], mirror)
+
+
+@pytest.mark.parametrize(
+    ("joints", "mirror", "words"),
+    [
+        (["a"], None, "the mirror is None; give a table of the joints"),
+        ([1, 2], {1: 2}, r"is given \[1, 2\]; give a list of names"),
+        ("ab", {"a": "b"}, "is given 'ab'; give a list of names"),
+        (["a", "a"], {"a": "a"}, "the list of joints names a twice; name it once"),
+        (["a", "b"], {"left-right": {"a": 1}}, "give by name the name of its image"),
+    ],
+)
+def test_joints_that_are_no_list_of_names_are_refused(joints, mirror, words):
+    with pytest.raises(UserError, match=words):
+        Body(joints, mirror)
 
 
 def test_a_scan_of_a_grid_turns_by_quarters_only_where_it_is_square():

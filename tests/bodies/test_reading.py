@@ -153,3 +153,8 @@ def test_the_command_answers_first_and_says_why_not(tmp_path):
     path.write_text(biped(right_y=-0.2))
     assert "no mirror or turn" in esp("mirror", path, code=1).stdout
     assert "no model file" in refused("mirror", tmp_path / "none.xml")
+    assert "there is no folder nowhere; name the one" in refused("mirror", path, "--root", "nowhere")
+    with pytest.raises(UserError, match="is MJCF, not URDF; read it with"):
+        Body.from_urdf(path)
+    with pytest.raises(UserError, match="a model is given as NoneType; give the path of a file"):
+        Body.from_mjcf(None)
