@@ -122,6 +122,9 @@ def _joint_gap(frame: Frame, R: Floats, i: int, j: int) -> float:
     apart = R @ frame.anchor[i] - frame.anchor[j]
     if kind == FREE and frame.base in (i, j):
         return 0.0 if i == j else _APART
+    if kind == FREE:  # of like bodies, the one that begins where the image does
+        starts = [frame.model.qpos0[frame.qpos_of(k)][:3] - frame.centre for k in (i, j)]
+        return 1e-6 * float(np.linalg.norm(R @ starts[0] - starts[1])) / frame.size
     gap = 0.0
     if kind in (SLIDE, HINGE):
         axis = image_of_axis(frame, R, i)

@@ -22,6 +22,8 @@ QPOS_WIDTH, DOF_WIDTH = (7, 4, 1, 1), (6, 3, 1, 1)  # numbers of a joint's posit
 class Frame:
     """A model at rest: where its joints and masses are, all seen from the middle of its base, its heaviest free body.
 
+    Other free bodies are put at the base, since where they begin is no property of theirs.
+
     Mirrors and turns leave `centre` [3] where it is; its z is 0. `axes` [3, 3] are the base's own, in columns: elements
     are told by them. `size` is the largest distance of a joint or mass from their middle, m. `places` [bodies, 2, 3]
     are origin and middle of mass of each body, without what is fixed to it, and `inertia` [bodies, 3, 3] is along the
@@ -31,10 +33,12 @@ class Frame:
     def __init__(self, model: Any, seconds: float = math.inf) -> None:
         self.model, data = model, mujoco.MjData(model)
         self._seconds, self._until = seconds, time.thread_time() + seconds
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
         free = [j for j in range(model.njnt) if model.jnt_type[j] == FREE]
         free.sort(key=lambda j: -model.body_subtreemass[model.jnt_bodyid[j]])
+        for j in free[1:]:
+            data.qpos[self.qpos_of(j)][:3] = model.qpos0[self.qpos_of(free[0])][:3]
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
         self.base = free[0] if free else None
         self.moving = [b for b in range(1, model.nbody) if model.body_jntnum[b]]
         self.parent = {b: self.carrier(b) for b in self.moving}

@@ -220,3 +220,16 @@ def test_a_base_beside_the_origin_has_no_state():
     assert body_of(changed('pos="0 0 1"', 'pos="3 0 1"')).state(), "flip-x leaves x"
     with pytest.raises(UserError, match="the base does not begin over the origin, so its state has no layout"):
         body_of(changed('pos="0 0 1"', 'pos="0 2 1"')).state()
+
+
+def test_where_a_free_object_begins_does_not_matter():
+    ball = '<body name="{}" pos="{} {} 0.1"><freejoint/><geom size="0.05" friction="{}"/></body>'
+    text = changed(FLOOR, FLOOR + ball.format("one", 0.5, 0.7, 1))
+    found = body_of(text).found["flip-x"]
+    assert found.proof.verdict == "exact"
+    assert found.match.joint[0] == 0
+    # of two that are alike, the one that begins at the image
+    both = body_of(changed(FLOOR, FLOOR + ball.format("two", 0.5, -0.7, 1), text)).found["flip-x"]
+    assert (both.proof.verdict, both.match.joint[:2].tolist()) == ("exact", [1, 0])
+    unlike = body_of(changed(FLOOR, FLOOR + ball.format("two", 0.5, -0.7, 2), text)).found["flip-x"]
+    assert unlike.proof.verdict == "nearly"
