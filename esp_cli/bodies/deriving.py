@@ -86,8 +86,7 @@ def _matched(frame: Frame, R: Floats) -> tuple[dict[int, int], dict[int, int]]:
         if off > FAR:
             return _APART, (), ()
         own, pairs = _assigned(frame.joints(b), frame.joints(c), lambda i, j: _joint_gap(frame, R, i, j))
-        own += abs(frame.mass[b] - frame.mass[c]) / total
-        own += off
+        own += abs(frame.mass[b] - frame.mass[c]) / total + off
         # of two legs on one line, as in a planar walker, a mirror exchanges them
         own += 1e-9 * (b == c and mirrored)
         hanging, below = _assigned(frame.children[b], frame.children[c], lambda x, y: cost(x, y)[0])
@@ -179,17 +178,12 @@ def _pulls(frame: Frame, qpos: Floats) -> Floats:
 def _pulled_maps(
     frame: Frame, bodies: Floats, qpos: Floats, offset: Floats, qvel: Floats
 ) -> tuple[Floats, Floats, tuple[str, ...]]:
-    """Return the maps of controls and of tendons, and the actuators without an image.
-
-    None pulls with the image of their moment at rest and in another pose, for none of which all may be 0, or none acts
-    on the image of their body.
-    """
-    model, rest = frame.model, frame.model.qpos0
-    other = rest.copy()
+    """Return the maps of controls and of tendons, by their pull at rest and in another pose; and actuators without."""
+    model, rest, other = frame.model, frame.model.qpos0, frame.model.qpos0.copy()
     mujoco.mj_integratePos(model, other, 0.3 * np.random.default_rng(0).normal(size=model.nv), 1.0)
     here = np.hstack([_pulls(frame, q) @ qvel.T for q in (rest, other)])
     there = np.hstack([_pulls(frame, qpos @ q + offset) for q in (rest, other)])
-    tendons = _images(here[model.nu :], there[model.nu :], lambda *_: 0.0)
+    tendons = _images(here[model.nu :], there[model.nu :], lambda *_: {})
     on_body = model.actuator_trntype == mujoco.mjtTrn.mjTRN_BODY  # pulls where it touches, as adhesion does
     held = np.eye(model.nbody)[model.actuator_trnid[:, 0] * on_body] * on_body[:, None]
     if idle := [a for a in range(model.nu) if not (on_body[a] or np.abs(here[a]).max() > 1e-9)]:
@@ -197,22 +191,21 @@ def _pulled_maps(
         raise UserError(f"not covered: in no pose that was looked at does anything pull of the actuators {names}")
     turned = np.where((model.actuator_gaintype == 0) & (model.actuator_gainprm[:, 0] < 0), -1.0, 1.0)[:, None]
     here, there = (turned * x[: model.nu] * ~on_body[:, None] for x in (here, there))
-    ctrl = _images(np.hstack([here, held @ bodies.T]), np.hstack([there, held]), partial(_unlike_actuators, model))
-    lost = np.flatnonzero(~ctrl.any(0)).tolist()
-    return ctrl, tendons, tuple(printable(frame.name("actuator", a)) for a in lost)
+    ctrl = _images(np.hstack([here, held @ bodies.T]), np.hstack([there, held]), partial(actuator_shares, model))
+    return ctrl, tendons, tuple(printable(frame.name("actuator", a)) for a in range(model.nu) if not ctrl[:, a].any())
 
 
-def _images(here: Floats, there: Floats, unlike: Callable[[int, int, float], float]) -> Floats:
-    """Return the signed map [n, n] of what pulls, image `here` [n, k] to `there`; `unlike` adds to a pair's cost."""
+def _images(here: Floats, there: Floats, unlike: Callable[[int, int, float], dict[str, float]]) -> Floats:
+    """Return the signed map [n, n] of what pulls, image `here` [n, k] to `there`, for those that are least `unlike`."""
     scales = [np.abs(x).max(axis=1, initial=0) for x in (here, there)]
-    unit, other = (
-        x / np.where(size > 1e-9, size, np.inf)[:, None] for x, size in zip((here, there), scales, strict=True)
-    )
+    unit, other = (x / np.where(s > 1e-9, s, np.inf)[:, None] for x, s in zip((here, there), scales, strict=True))
     gaps = np.stack([cdist(unit, x, "chebyshev") for x in (other, -other)])
     gaps += 0.1 * np.abs(np.subtract.outer(*scales)) / max(scales[0].max(initial=0), 1e-12)
     gaps[1] += 1e-9  # two that pull one joint opposite ways: each has an image of its own sense
     for back, a, b in np.argwhere(gaps <= 3 * LOOSE):
-        gaps[back, a, b] += unlike(a, b, -1.0 if back else 1.0)
+        shares = unlike(a, b, -1.0 if back else 1.0)
+        gaps[back, a, b] += _UNLIKE * sum(shares.values())
+        gaps[back, a, b] += _APART * any(shares.get(what, 0) > _SLOWER for what in ("kind", "dynamics", "delay"))
     found, gap = np.zeros((len(here),) * 2), gaps.min(0)
     for a, b in zip(*linear_sum_assignment(gap), strict=True):
         if gap[a, b] <= 3 * LOOSE:
@@ -220,21 +213,14 @@ def _images(here: Floats, there: Floats, unlike: Callable[[int, int, float], flo
     return found
 
 
-def _unlike_actuators(model: Any, a: int, b: int, sign: float) -> float:
-    types = np.column_stack([getattr(model, f"actuator_{of}type") for of in ("gain", "bias", "dyn")])
-    shares = actuator_shares(model, a, b, sign)
-    if (types[a] != types[b]).any() or max(shares["dynamics"], shares["delay"]) > _SLOWER:
-        return _APART
-    return _UNLIKE * sum(shares.values())
-
-
 def actuator_shares(model: Any, a: int, b: int, sign: float) -> dict[str, float]:
     """Return by property how far actuator b is from the image of a, whose control it takes with a sign."""
     gains = model.actuator_gainprm
     # a gain of the other sign turns the control, not the force
     turned = -1.0 if (gains[a, 0] * gains[b, 0] < 0) and model.actuator_gaintype[a] == 0 else 1.0
-    values = {"gain": [turned * gains[a], gains[b]], "dynamics": model.actuator_dynprm[[a, b]]}
-    values["dynamics"] = values["dynamics"] * bool(model.actuator_dyntype[a])
+    kinds = np.stack([model.actuator_gaintype, model.actuator_biastype, model.actuator_dyntype])
+    values: dict[str, Any] = {"kind": kinds[:, [a, b]].T, "gain": [turned * gains[a], gains[b]]}
+    values["dynamics"] = model.actuator_dynprm[[a, b]] * bool(model.actuator_dyntype[a])
     for what, name in (("bias", "biasprm"), ("early activation", "actearly"), ("delay", "delay")):
         values[what] = getattr(model, f"actuator_{name}")[[a, b]]
     for what, name in (("force range", "force"), ("control range", "ctrl"), ("activation range", "act")):

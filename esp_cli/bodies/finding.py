@@ -172,16 +172,13 @@ def _of_tendon(frame: Frame, match: Match, t: int) -> dict[str, float]:
     """Return how far limits and spring of a tendon are from those of its image; of one without, from none."""
     model, image, rest = frame.model, match.tendons[:, t], frame.model.tendon_length0[:, None]
     u, sign, limited = int(np.abs(image).argmax()), image.sum(), model.tendon_limited[:, None]
+    slack = (model.tendon_lengthspring - rest) * (model.tendon_stiffness != 0)[:, None]
     ranges = [
         (model.tendon_range - rest) * limited,
-        (model.tendon_lengthspring - rest) * (model.tendon_stiffness != 0)[:, None],
+        slack,
         model.tendon_actfrcrange * model.tendon_actfrclimited[:, None],
     ]
-    stops = [
-        model.tendon_solref_lim * limited,
-        model.tendon_solimp_lim * limited,
-        model.tendon_margin[:, None] * limited,
-    ]
+    stops = [np.column_stack([model.tendon_solref_lim, model.tendon_solimp_lim, model.tendon_margin]) * limited]
     stops += frame.properties("tendon", "springyield").values()
     shares = [share(np.sort((sign or 1.0) * x[t]), x[u] * abs(sign)) for x in ranges]
     return {"limits or spring": max(*shares, *(share(x[t], x[u] * abs(sign)) for x in stops))}

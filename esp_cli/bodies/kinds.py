@@ -187,9 +187,7 @@ def named_parts(what: str, names: Sequence[str], tables: Mapping[str, Any]) -> P
     A table, or one by element, holds by part its image, with "-" where the sign changes, or follows from its partner.
     """
     names = _listed(f"the list of {what}", names)
-    if not isinstance(tables, Mapping):
-        raise UserError(f"the mirror is {tables!r}; give a table of the {what}: {{'left': 'right'}}")
-    if tables and all(isinstance(value, str) for value in tables.values()):
+    if not isinstance(tables, Mapping) or (tables and all(isinstance(value, str) for value in tables.values())):
         tables = {"left-right": tables}
     generators = {_element_of(word): _matrix(what, names, table) for word, table in tables.items()}
     group = FiniteGroup.generated_by("the body", list(generators))

@@ -6,6 +6,7 @@ its own control: planted mistakes (the sign of a joint pair, a joint that stays 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -279,7 +280,7 @@ def _lowered(frame: Frame, data: Any, sample: Sample) -> Sample | None:
     low = next((z for z in (start - reach, *stands) if z < start and touches(z) > own), None)
     if low is None:
         return None
-    while high - low > reach / 500:
+    for _ in range(math.ceil(math.log2((high - low) / reach * 500))):
         middle = (high + low) / 2
         high, low = (high, middle) if touches(middle) > own else (middle, low)
     qpos = sample[0].copy()

@@ -25,19 +25,15 @@ def shape_images(frame: Frame, R: Floats, b: int, c: int) -> list[tuple[int, int
                 off = float(np.linalg.norm(R @ place - there)) / frame.size
                 row[k] = min(max(off, share(R @ spread @ R.T, extent)), 0.99)  # rather than one of another type
                 row[k] += 1e-9 * any(share(x[g], x[h]) > 0 for x in contacts.values())  # of two at one place
-    found = {int(i): int(k) for i, k in zip(*linear_sum_assignment(table), strict=True)}
-    return [
-        (own[i][0], other[found[i]][0], min(float(table[i, found[i]]), 1.0)) if i in found else (own[i][0], -1, 1.0)
-        for i in range(len(own))
-    ]
+    found = {i: (other[k][0], float(table[i, k])) for i, k in zip(*linear_sum_assignment(table), strict=True)}
+    return [(g, *found.get(i, (-1, 1.0))) for i, (g, *_) in enumerate(own)]
 
 
 def unlike_contacts(frame: Frame, match: Match, wrong: float) -> tuple[str, ...]:
     """Return what may touch otherwise than its image, by a share of more than `wrong`."""
     model, image = frame.model, np.where(match.bodies.any(0), match.bodies.argmax(0), -1)
     image[0] = 0
-    may, geoms, found = frame.touching, np.full(frame.model.ngeom, -1), list[str]()
-    contacts = frame.properties("geom", *_OF_A_GEOM)
+    geoms, found, contacts = np.full(model.ngeom, -1), list[str](), frame.properties("geom", *_OF_A_GEOM)
     for b in frame.shapes:
         for g, h, gap in shape_images(frame, match.world, b, int(image[b])):
             geoms[g] = h
@@ -45,7 +41,7 @@ def unlike_contacts(frame: Frame, match: Match, wrong: float) -> tuple[str, ...]
             unlike += [what for what, x in contacts.items() if h >= 0 and share(x[g], x[h]) > wrong]
             found += [f"{what} of {_name(frame, g)}" for what in unlike]
     bodies = np.zeros((model.nbody, model.nbody), dtype=bool)
-    np.logical_or.at(bodies, tuple(model.geom_bodyid[np.array(np.nonzero(may))]), True)
+    np.logical_or.at(bodies, tuple(model.geom_bodyid[np.array(np.nonzero(frame.touching))]), True)
     known = [b for b in range(model.nbody) if image[b] >= 0]
     lost = [(b, c) for b in known for c in known if b < c and bodies[b, c] and not bodies[image[b], image[c]]]
     found += ["contact of " + " and ".join(printable(frame.name("body", b)) for b in pair) for pair in lost]

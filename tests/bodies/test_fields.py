@@ -188,7 +188,7 @@ def test_tables_that_are_no_symmetry_are_refused(mirror, words):
 @pytest.mark.parametrize(
     ("joints", "mirror", "words"),
     [
-        (["a"], None, "the mirror is None; give a table of the joints"),
+        (["a"], None, "the mirror of the joints is None; give by name the name of its image"),
         ([1, 2], {1: 2}, r"is given \[1, 2\]; give a list of names"),
         ("ab", {"a": "b"}, "is given 'ab'; give a list of names"),
         (["a", "a"], {"a": "a"}, "the list of joints names a twice; name it once"),
