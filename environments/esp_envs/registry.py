@@ -8,8 +8,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import torch
+from pydantic import ValidationError
 
 from esp_envs.base import Environment, generators_for
+from esp_envs.errors import UserError
 from esp_envs.installed import Registry
 
 TASKS: Registry[Environment] = Registry(
@@ -61,4 +63,10 @@ def make(
         UserError: unknown task, unknown setting, or a value out of range.
     """
     cls = task_class(name)
-    return cls(cls.Settings(**(settings or {})), num_envs, generators_for(seeds, device))
+    try:
+        chosen = cls.Settings(**(settings or {}))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(map(str, first["loc"]))
+        raise UserError(f"{name} does not take these settings{f', {where}' if where else ''}: {first['msg']}") from None
+    return cls(chosen, num_envs, generators_for(seeds, device))

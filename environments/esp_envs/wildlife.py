@@ -62,8 +62,8 @@ class Wildlife(BatchedTask):
     N drones and a poacher move on a grid of cells whose opposite edges are joined. One drone has to hover above the
     poacher while others stand beside it.
 
-    Actions: 0 rest, 1 up, 2 right, 3 down, 4 left: to the next cell. Drones that would share a cell stay where they
-    were, all of them. The poacher moves in a uniformly random direction with probability 0.8, else it rests.
+    Actions: 0 rest, 1 up, 2 right, 3 down, 4 left: to the next cell. Drones that would share a cell all stay, though
+    another may have moved to where one was. The poacher moves at random with probability 0.8, else it rests.
 
     Observation of one drone, a picture of 9 numbers a cell and N - 1 planar vectors (7 x 7 cells, N = 3: 445 numbers):
 

@@ -74,7 +74,8 @@ class RolesLearner(Learner):
             elements = admitted_elements(prior.transforms, unrestricted(role))
             names = set() if isinstance(elements, Group) else {element.name for element in elements}
             prior = prior.model_copy(update={"weights": {n: w for n, w in prior.weights.items() if n in names}})
-        if getattr(config, "critic_input", None) == "observations" and role.joint_fields is not None:
+        reads_all = getattr(config, "critic_input", None) == "observations" and role.joint_fields is not None
+        if reads_all and not network.free_of_counts:  # a network over sets takes rows of the role's own agents alone
             config = config.model_copy(update={"critic_input": "state"})  # which is the observations of all roles
         return self._cls(view, config, network, prior, self._own[name], self._of_prior[name])
 

@@ -20,7 +20,7 @@ from esp_cli.networks.layers import GAINS, SeedMLP
 from esp_cli.networks.ordering import joined, place_of, reader_of, ways_to
 from esp_cli.networks.plain import CompiledConfig
 from esp_envs.errors import UserError
-from esp_envs.spec import Layout
+from esp_envs.spec import Items, Layout
 
 
 class SetShape(CompiledConfig, ABC):
@@ -191,8 +191,8 @@ class TeamFeatures(nn.Module):
         rows = rows or config.rows(layout, spaces.shifts, 0 if io.reads == "state" else config.near, compiled)
         self.encoder = SetEncoder(generators, rows, config)
         self.num_agents = spaces.num_agents if joint else 0
-        found = [f.name for f in layout.families if f.count == spaces.num_agents] if io.reads == "state" else []
-        self.each = "agents" if "agents" in found else next(iter(found), "")
+        of_agents = (f.name for f in layout.families if any(part.field.items is Items.AGENTS for part in f.parts))
+        self.each = next(of_agents, "") if io.reads == "state" else ""
         inputs = self.encoder.width if joint else config.width * (beside > 0)
         self.agents = Embedding(generators, (inputs + beside, config.width), config) if inputs else None
         self.width = self.encoder.width * (not joint) + 2 * config.width * (self.agents is not None)

@@ -24,6 +24,14 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         del sys.modules[name]
 
 
+@pytest.mark.parametrize("settings", [{"num_agents": 0}, {"agents": 3}])
+def test_settings_that_a_task_does_not_take_are_refused_in_one_sentence(settings: dict[str, int]) -> None:
+    with pytest.raises(
+        esp_envs.UserError, match=rf"^navigation does not take these settings, {next(iter(settings))}: .+"
+    ):
+        make("navigation", 1, [0], settings)
+
+
 def test_a_name_alone_never_imports_a_module(folder: Path) -> None:
     (folder / "trap.py").write_text("from pathlib import Path\nPath('sprung').touch()\n")
     with pytest.raises(ValueError, match="'trap:Trap' is not installed; add --task trap:Trap"):

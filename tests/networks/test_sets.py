@@ -1,6 +1,7 @@
 """Networks over sets: neither order nor number of like things matters, by torch and by kernels."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -174,6 +175,19 @@ def test_values_of_agents_with_rewards_of_their_own_change_places_with_them(read
 def test_weights_know_no_count(reads):
     few, many = network(scene()[0], reads), network(scene(num_agents=6, num_landmarks=4)[0], reads)
     assert {n: p.shape for n, p in few.named_parameters()} == {n: p.shape for n, p in many.named_parameters()}
+
+
+def test_values_are_read_off_the_agents_though_other_things_are_as_many_and_stand_first():
+    things = Field("landmarks", Kind.VECTOR, 3)
+    agents = Field("place", Kind.VECTOR, 3, items=Items.AGENTS, family="robots")
+    state = layout(replace(things, family="landmarks"), agents)
+    spec = replace(make("navigation", 1, [0]).spec, state=state, shared_reward=False)
+    x = torch.randn(2, 5, 12, generator=torch.Generator().manual_seed(0))
+    swapped = torch.cat([x[..., :6], x[..., 8:10], x[..., 6:8], x[..., 10:]], -1)
+    value = network(spec, "state")
+    torch.testing.assert_close(value(swapped), value(x)[..., [1, 0, 2]], **CLOSE)
+    with pytest.raises(UserError, match="does not say which numbers are whose"):
+        network(replace(spec, state=layout(replace(things, family="landmarks"))), "state")
 
 
 def test_one_looks_at_the_nearest_alone():

@@ -40,6 +40,9 @@ class PredatorPreySettings(ParticleSettings):
         """The rotations that actions, dynamics and reward carry; the learning prey's bounds are a square."""
         return super().turns if self.control == "predators" else "c4"
 
+    def without_effect(self) -> frozenset[str]:
+        return frozenset({"sees"} if self.control == "prey" else ())
+
     @model_validator(mode="after")
     def _one_drives_the_prey(self) -> PredatorPreySettings:
         if self.control != "predators" and self.prey != "random":
