@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -132,7 +133,7 @@ def draw_curves(curves: Mapping[str, Sequence[tuple[float, float]]], steps: int,
     import numpy as np
 
     columns = max(10, min(_WIDEST, width - _LABEL - 2))
-    values = [value for points in curves.values() for _, value in points]
+    values = [value for points in curves.values() for _, value in points if math.isfinite(value)]
     low, high = (min(values), max(values)) if values else (0.0, 0.0)
     grid = np.full((_HEIGHT, columns), -1)
     for index, points in enumerate(curves.values()):
@@ -141,8 +142,9 @@ def draw_curves(curves: Mapping[str, Sequence[tuple[float, float]]], steps: int,
             shown = np.arange(columns) * steps / (columns - 1)
             shown = shown[(shown >= at[0]) & (shown <= max(at[-1], steps / columns))]
             share = (np.interp(shown, at, means) - low) / max(high - low, 1e-9)
-            rows = np.round((1 - share) * (_HEIGHT - 1)).astype(int)
-            grid[rows, np.round(shown / steps * (columns - 1)).astype(int)] = index
+            seen = np.isfinite(share)  # where a seed stopped there is no mean
+            rows = np.round((1 - share[seen]) * (_HEIGHT - 1)).astype(int)
+            grid[rows, np.round(shown[seen] / steps * (columns - 1)).astype(int)] = index
     text = Text()
     for number, row in enumerate(grid):
         level = {0: high, _HEIGHT - 1: low}.get(number) if values else None

@@ -49,3 +49,11 @@ def test_curves_are_drawn_as_wide_as_the_terminal_and_as_far_as_they_are() -> No
     assert rows[-1].split() == ["○", "a", "2.0", "●", "b", "1.0"]
     assert "○" not in draw_curves({"a": [], "b": []}, 100, 60).plain.splitlines()[5]
     Console(width=20).print(drawn)
+
+
+def test_a_stopped_seed_leaves_a_gap_in_a_curve() -> None:
+    ends = (100, float("nan"))
+    rows = draw_curves({"a": [(0, 1.0), (50, 2.0), ends], "b": [(0, 3.0), ends]}, 100, 60).plain.splitlines()
+    assert rows[0].startswith("       3 │●")
+    assert max(row.rfind("○") for row in rows[:12]) == 10 + 49 // 2
+    assert "○" not in "".join(draw_curves({"a": [ends], "b": [ends]}, 100, 60).plain.splitlines()[:12])
