@@ -78,6 +78,7 @@ def _judge(benchmark: Benchmark, choices: StudyChoices) -> None:
         trials = Trials.create(out, planned)
         failed = studying.follow(trials, trials.cells_of(planned), resources, requests)
         if not (requests or failed):
+            benchmark.write_scores(trials)
             study = benchmark.judged(trials)
             fresh = StudyFolder.create(out / FRESH, study)
             failed = studying.run_cells(fresh, study, resources, requests)

@@ -16,7 +16,7 @@ import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 from pydantic import Field, ValidationError
 
@@ -77,7 +77,7 @@ class StudyFolder(RunSet):
         self.study = study
 
     @classmethod
-    def create(cls, path: Path, study: Study, keep: bool = True) -> StudyFolder:
+    def create(cls, path: Path, study: Study, keep: bool = True) -> Self:
         """Make a study folder, or go on with the one that is there; cells that it does not have yet are added.
 
         Cells that are there and not in the study stay, unless `keep` is False; their runs stay on the disk.
@@ -89,7 +89,7 @@ class StudyFolder(RunSet):
         return folder
 
     @classmethod
-    def planned(cls, path: Path, study: Study, keep: bool = True) -> tuple[StudyFolder, bool]:
+    def planned(cls, path: Path, study: Study, keep: bool = True) -> tuple[Self, bool]:
         """Return what `create` makes of a study, and whether that differs from what is there; writes nothing."""
         # As JSON shows it, so that it equals what is read again: a tuple in a task's settings becomes a list.
         study = Study.model_validate_json(study.model_dump_json())
@@ -126,7 +126,7 @@ class StudyFolder(RunSet):
         return cls(path, study.model_copy(update=merged)), True
 
     @classmethod
-    def open(cls, path: Path) -> StudyFolder:
+    def open(cls, path: Path) -> Self:
         """Open an existing study, unless it is missing, damaged, foreign, or of a newer version."""
         if not path.is_dir():
             raise UserError(f"{path} is no study: there is no such folder")

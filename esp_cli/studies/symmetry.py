@@ -8,10 +8,12 @@ from __future__ import annotations
 import json
 import math
 import random
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -26,7 +28,7 @@ from esp_cli.studies.study import Study, StudyFolder
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config
 from esp_cli.training.folder_names import FRESH, METRICS
-from esp_cli.training.metrics import column, read_metrics
+from esp_cli.training.metrics import column, read_last_row, read_metrics
 from esp_envs.errors import UserError
 from esp_envs.registry import TASKS as TASK_CLASSES
 
@@ -128,6 +130,7 @@ _OF_NETWORKS: Space = {"network.relax": (0.1, 0.3, 1.0, 3.0)}
 _OF_BATCHES = ("gamma", "num_minibatches", "num_envs")
 TRIAL_SEEDS = (100, 101, 102)
 _SCORED = 2  # greedy evaluations at the end of a trial whose mean is its score
+_RETURN = "eval/return_greedy"
 
 
 def draws(algorithm: str, count: int) -> list[dict[str, object]]:
@@ -143,7 +146,7 @@ def draws(algorithm: str, count: int) -> list[dict[str, object]]:
 
 def score(run: Path) -> float:
     """Return the mean of a trial's last two greedy evaluations over its seeds, -inf where one is not finite."""
-    _, returns = column(read_metrics(run / METRICS), "eval/return_greedy")
+    _, returns = column(read_metrics(run / METRICS), _RETURN)
     return float(np.nan_to_num(returns[-_SCORED:], nan=-np.inf).mean())
 
 
@@ -151,11 +154,13 @@ class Trials(StudyFolder):
     """The trials of a benchmark: runs without a final evaluation, in whose folder `fresh` is the study that judges."""
 
     def is_finished(self, cell: Cell) -> bool:
-        return self.is_trained(cell)
+        """Return whether a trial is trained, or has ended without a policy since every seed stopped."""
+        last = read_last_row(self.run_path(cell) / METRICS).get(_RETURN)
+        return self.is_trained(cell) or (isinstance(last, list) and all(value is None for value in last))
 
     @classmethod
-    def create(cls, path: Path, study: Study, keep: bool = True) -> Trials:
-        """Make the folder, or go on with it; what is judged already gets no further trials."""
+    def planned(cls, path: Path, study: Study, keep: bool = True) -> tuple[Self, bool]:
+        """Return what `create` makes of the folder; what is judged already gets no further trials."""
         if StudyFolder.is_one(path / FRESH) and cls.is_one(path):
             known = {cell.name for cell in cls.open(path).study.cells}
             done = {cell.name for cell in StudyFolder.open(path / FRESH).study.cells}
@@ -164,7 +169,7 @@ class Trials(StudyFolder):
                     raise UserError(
                         f"{path / FRESH} has judged {judged} already; keep its --budget, or choose another --out"
                     )
-        return cls(path, super().create(path, study, keep).study)
+        return super().planned(path, study, keep)
 
 
 class Benchmark:
@@ -236,7 +241,6 @@ class Benchmark:
         return planned(resolve_config(board.task, algorithm, preset, steps, seeds, request.device, settings))
 
     def _cell(self, name: str, method: str, draw: int, trial: bool) -> Cell:
-        first = next(other for task, other in self.taken if task == name)
         learner = () if self.algorithm == "mappo" else (self.algorithm,)
         stem = "-".join((file_name(name), format_exactly(self.steps(name, trial=False)), *learner))
         own = f"{stem}-{file_name(method)}"
@@ -245,28 +249,49 @@ class Benchmark:
             panel=", ".join((name, *map(str.upper, learner), format_exactly(self.steps(name, trial)))),
             variant=f"{method}, draw {draw}" if trial else method,
             config=self.config(name, method, draw, trial),
-            reference=None if trial or method == first else f"{stem}-{file_name(first)}",
         )
 
-    def _study(self, kind: str, title: str, cells: tuple[Cell, ...]) -> Study:
-        same = {"command": self.request.command, "episodes": self.request.episodes, "left_out": self.left_out}
-        return Study(kind=kind, title=title, rows="variants", cells=cells, **same)
+    def _study(self, kind: str, title: str, cells: Iterable[Cell], left_out: Mapping[str, str]) -> Study:
+        same = {"command": self.request.command, "episodes": self.request.episodes, "left_out": dict(left_out)}
+        return Study(kind=kind, title=title, rows="variants", cells=tuple(cells), **same)
 
     @cached_property
+    def trials_of(self) -> dict[tuple[str, str], list[Cell]]:
+        """By task and method its trials, one for each draw."""
+        return {pair: [self._cell(*pair, draw, trial=True) for draw in range(self.budget)] for pair in self.taken}
+
+    @property
     def trials(self) -> Study:
         """The plan of the trials of all methods on all tasks."""
-        cells = [self._cell(*pair, draw, trial=True) for pair in self.taken for draw in range(self.budget)]
-        return self._study("symmetry-trials", self.title, tuple(cells))
+        return self._study("symmetry-trials", self.title, chain(*self.trials_of.values()), self.left_out)
+
+    def scores(self, trials: Trials) -> dict[tuple[str, str], list[float]]:
+        """Return by task and method the scores of its trials; one that is not finished counts as 0, for a forecast."""
+        return {
+            pair: [score(trials.run_path(cell)) if trials.is_finished(cell) else 0.0 for cell in own]
+            for pair, own in self.trials_of.items()
+        }
 
     def judged(self, trials: Trials) -> Study:
-        """Plan the runs that judge, with each method's best trial, the first of equals; `trials.json` has scores."""
-        cells, scores, size = [], dict[str, list[float | None]](), self.budget
-        of_trials = [score(trials.run_path(cell)) for cell in self.trials.cells]
-        for k, (name, method) in enumerate(self.taken):
-            own = of_trials[k * size : (k + 1) * size]
-            scores[f"{name}: {method}"] = [value if math.isfinite(value) else None for value in own]
-            cells.append(self._cell(name, method, int(np.argmax(own)), trial=False))
-        document = {"draws": draws(self.algorithm, size), "seeds": TRIAL_SEEDS, "scores": scores}
-        replace_file(trials.path / "trials.json", (json.dumps(document, indent=1) + "\n").encode())
+        """Plan the runs that judge, with each method's best trial, the first of equals; the first is the reference."""
+        cells, left_out, firsts = list[Cell](), dict(self.left_out), dict[str, str]()
+        for (name, method), own in self.scores(trials).items():
+            if max(own) == -math.inf:
+                left_out[f"{name}: {method}"] = "a seed stopped in each of its trials"
+                continue
+            cell = self._cell(name, method, int(np.argmax(own)), trial=False)
+            first = firsts.setdefault(name, cell.name)
+            cells.append(cell.model_copy(update={"reference": None if first == cell.name else first}))
+        if not cells:
+            raise UserError(f"a seed stopped in every trial in {trials.path}, so there is nothing to judge")
         title = "Symmetry in multi-agent learning, each method tuned on equal steps"
-        return self._study("symmetry", title, tuple(cells))
+        return self._study("symmetry", title, cells, left_out)
+
+    def write_scores(self, trials: Trials) -> None:
+        """Write `trials.json`: what was drawn, and the scores."""
+        scores = {
+            ": ".join(pair): [value if math.isfinite(value) else None for value in own]
+            for pair, own in self.scores(trials).items()
+        }
+        document = {"draws": draws(self.algorithm, self.budget), "seeds": TRIAL_SEEDS, "scores": scores}
+        replace_file(trials.path / "trials.json", (json.dumps(document, indent=1) + "\n").encode())

@@ -31,7 +31,8 @@ def write_trials(path: Path, asked: Benchmark, ends: dict[str, float]) -> Trials
     folder = Trials.create(path, asked.trials)
     for cell in folder.study.cells:
         run, end = folder.prepare(cell), ends.get(cell.name, 0.0)
-        rows = ({"step": k, "eval/return_greedy": [value] * 3} for k, value in enumerate((9.0, end, end)))
+        means = [None if math.isnan(mean) else mean for mean in (9.0, end, end)]
+        rows = ({"step": k, "eval/return_greedy": [mean] * 3} for k, mean in enumerate(means))
         run.metrics_path.write_text("".join(json.dumps(row) + "\n" for row in rows))
         run.policy_path.write_bytes(b"weights")
     return folder
@@ -101,13 +102,31 @@ def test_every_method_is_taken_somewhere() -> None:
 def test_the_best_trial_is_judged_and_the_first_of_equal_ones(tmp_path: Path) -> None:
     asked = benchmark()
     ends = {"navigation-200k-plain-2": 5.0, "navigation-200k-esp-0": -1.0}
-    plain, esp = asked.judged(write_trials(tmp_path / "s", asked, ends)).cells
+    trials = write_trials(tmp_path / "s", asked, ends)
+    plain, esp = asked.judged(trials).cells
     assert plain.config == asked.config("navigation", "plain", 2, trial=False)
     assert esp.config == asked.config("navigation", "ESP", 1, trial=False)
+    asked.write_scores(trials)
     assert json.loads((tmp_path / "s" / "trials.json").read_text())["scores"] == {
         "navigation: plain": [0.0, 0.0, 5.0],
         "navigation: ESP": [-1.0, 0.0, 0.0],
     }
+
+
+def test_a_trial_whose_seeds_all_stopped_has_ended_and_a_method_of_such_trials_is_left_out(tmp_path: Path) -> None:
+    asked = benchmark(variants=("plain", "ESP", "copies"), budget=2)
+    ends = {f"navigation-200k-{stopped}": math.nan for stopped in ("plain-0", "plain-1", "esp-0")}
+    trials = write_trials(tmp_path / "s", asked, ends)
+    for cell in trials.study.cells[:3]:
+        (trials.run_path(cell) / "policy.safetensors").unlink()
+    assert all(map(trials.is_finished, trials.study.cells))
+    study = asked.judged(trials)
+    references = {cell.variant: cell.reference for cell in study.cells}
+    assert references == {"ESP": None, "copies": "navigation-200k-esp"}
+    assert study.left_out == {"navigation: plain": "a seed stopped in each of its trials"}
+    assert study.cells[0].config == asked.config("navigation", "ESP", 1, trial=False)
+    with pytest.raises(UserError, match="so there is nothing to judge"):
+        benchmark(variants=("plain",), budget=2).judged(trials)
 
 
 def test_what_is_judged_gets_no_further_trials_but_other_methods_do(tmp_path: Path) -> None:
