@@ -55,12 +55,22 @@ def reproduce(
 
 
 def _forecast(benchmark: Benchmark, choices: StudyChoices) -> None:
-    pairs = {
-        f"{name}: {method}": (benchmark.config(name, method, 0, True), benchmark.config(name, method, 0, False))
-        for name, method in benchmark.taken
-    }
-    counts, what = (benchmark.budget, 1), f"{benchmark.budget} trials of each, and the run that judges it"
-    studying.forecast_tuned("symmetry", benchmark.title, pairs, counts, benchmark.request, choices, what)
+    from esp_cli.studies.forecast import Tuned, shares_left
+    from esp_cli.studies.study import StudyFolder
+    from esp_cli.studies.symmetry import Trials
+    from esp_cli.training.folder_names import FRESH
+
+    out, searches = choices.folder("symmetry"), {}
+    trials, _ = Trials.planned(out, benchmark.trials)
+    study = benchmark.judged(trials)
+    fresh, _ = StudyFolder.planned(out / FRESH, study)
+    for (name, method), own in benchmark.trials_of.items():
+        finals = [cell for cell in study.cells if own[0].name == f"{cell.name}-0"]
+        trial, final = (benchmark.config(name, method, 0, trial=trial) for trial in (True, False))
+        left = shares_left(trials, own), shares_left(fresh, finals)
+        searches[f"{name}: {method}"] = Tuned(trial, final, len(own) + len(finals), *left)
+    what = f"{benchmark.budget} trials of each, and the run that judges it"
+    studying.forecast_tuned(benchmark.title, out, searches, benchmark.request, choices, what)
 
 
 def _judge(benchmark: Benchmark, choices: StudyChoices) -> None:

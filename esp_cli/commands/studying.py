@@ -24,11 +24,10 @@ from esp_envs.installed import install
 if TYPE_CHECKING:
     from esp_cli.studies.catalogue import Request
     from esp_cli.studies.engine import Engine
-    from esp_cli.studies.forecast import Forecast
+    from esp_cli.studies.forecast import Forecast, Tuned
     from esp_cli.studies.run_set import Cell, RunSet
     from esp_cli.studies.scheduler import Scheduler
     from esp_cli.studies.study import Study, StudyFolder
-    from esp_cli.training.config import RunConfig
 
 
 @dataclass(frozen=True)
@@ -123,26 +122,20 @@ def _forecast(out: Path, study: Study, choices: StudyChoices) -> None:
         with console.TrainingProgress(len(study.cells), description="measure", unit="runs") as progress:
             folder = StudyFolder(out, study)
             found = forecast.forecast_study(folder, resources.reused, resources.jobs, progress.update)
-    _print_forecast(found, choices.json, f"{sum(run.status != 'finished' for run in found.runs)} runs to do")
+    left = sum(run.status == "waiting" for run in found.runs)
+    _print_forecast(found, choices.json, f"{left} run{'' if left == 1 else 's'} to do")
 
 
 def forecast_tuned(
-    kind: str,
-    title: str,
-    pairs: Mapping[str, tuple[RunConfig, RunConfig]],
-    counts: tuple[int, int],
-    request: Request,
-    choices: StudyChoices,
-    what: str,
+    title: str, out: Path, searches: Mapping[str, Tuned], request: Request, choices: StudyChoices, what: str
 ) -> None:
-    """Say `what` runs cost that are tuned and judged, in pairs and counts as of `studies.forecast.forecast_tuned`."""
+    """Say `what` is left of searches in a folder, and of the runs that judge."""
     from esp_cli.studies import forecast
 
-    out = choices.folder(kind)
     with open_resources(choices, out, request.device) as resources:
         jobs = resources.jobs
-    with console.TrainingProgress(len(pairs), description="measure", unit="runs") as progress:
-        found = forecast.forecast_tuned(title, out, pairs, counts, request.episodes, jobs, progress.update)
+    with console.TrainingProgress(len(searches), description="measure", unit="runs") as progress:
+        found = forecast.forecast_tuned(title, out, searches, request.episodes, jobs, progress.update)
     _print_forecast(found, choices.json, what)
 
 
@@ -152,7 +145,7 @@ def _print_forecast(found: Forecast, json: str | None, what: str) -> None:
         (
             run.name,
             f"{console.format_count(run.steps)} x {run.num_seeds}",
-            run.status if run.status == "finished" else f"at {console.format_count(run.step)}" if run.step else "new",
+            run.state,
             console.format_duration(run.seconds),
         )
         for run in found.runs

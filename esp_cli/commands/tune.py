@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -92,37 +92,59 @@ def _tuning(request: Request, priors: Sequence[str], space: Path | None, trial_s
     return tuning
 
 
-def _forecast(tuning: Tuning, request: Request, choices: StudyChoices) -> None:
-    pairs = {
-        f"{tuning.budget} trials, prior {prior}": (tuning.config(prior, {}), tuning.config(prior, {}, request.seeds))
-        for prior in tuning.priors
-    }
-    what = "all trials with the default settings, of which pruning saves about half"
-    studying.forecast_tuned("tune", tuning.title, pairs, (tuning.budget, 2), request, choices, what)
-
-
-def _tune(tuning: Tuning, request: Request, choices: StudyChoices) -> None:
+def _searches() -> type[Search]:
     try:
         from esp_cli.studies.search import Search
     except ImportError:
         raise UserError(f"Optuna is not installed: {install('tune')}") from None
+    return Search
+
+
+def _best(outcomes: Sequence[Outcome]) -> dict[str, tuple[int, Mapping[str, object]]]:
+    return {found.prior: (found.best, found.settings) for found in outcomes if found.best is not None}
+
+
+def _forecast(tuning: Tuning, request: Request, choices: StudyChoices) -> None:
+    from esp_cli.studies.forecast import Tuned, shares_left
+    from esp_cli.studies.study import StudyFolder
+    from esp_cli.studies.tuning import NAMES, fresh_study
+    from esp_cli.training.folder_names import FRESH
+
+    out, searches = choices.folder("tune"), {}
+    with _searches().looked_at(out, tuning) as search:
+        left = {prior: shares_left(search, [c for c in search.cells if c.panel == prior]) for prior in tuning.priors}
+        best = {} if any(left.values()) else _best([search.outcome(prior) for prior in tuning.priors])
+    study = fresh_study(tuning, best, request.seeds, request.episodes)
+    fresh, _ = StudyFolder.planned(out / FRESH, study, keep=False)
+    for prior, trials in left.items():
+        own = [cell for cell in fresh.unlike(fresh.study.cells) if cell.variant.startswith(f"{NAMES[prior]}, ")]
+        finals = shares_left(fresh, own) + [1.0] * any(left.values())  # the best settings are not known yet
+        configs = tuning.config(prior, {}), tuning.config(prior, {}, request.seeds)
+        count = tuning.budget + len(own) + any(left.values())
+        searches[f"{tuning.budget} trials, prior {prior}"] = Tuned(*configs, count, trials, finals)
+    what = "all trials with the default settings, of which pruning saves about half"
+    studying.forecast_tuned(tuning.title, out, searches, request, choices, what)
+
+
+def _tune(tuning: Tuning, request: Request, choices: StudyChoices) -> None:
     from esp_cli.studies.study import StudyFolder
     from esp_cli.studies.tuning import fresh_study
     from esp_cli.training.folder_names import FRESH
 
+    search_type = _searches()
     out, fresh = choices.folder("tune"), None
     judged = out / FRESH
     with (
         studying.open_resources(choices, out, tuning.device) as resources,
-        Search.held(out),
+        search_type.held(out),
         stop_requests("stopping every run after its iteration") as requests,
     ):
         if StudyFolder.is_one(judged):  # of a search that goes on: other seeds are refused before it does
             StudyFolder.planned(judged, fresh_study(tuning, {}, request.seeds, request.episodes))
-        search = Search.create(out, tuning)
+        search = search_type.create(out, tuning)
         failed = studying.follow(search, search.cells, resources, requests)
         outcomes = [search.outcome(prior) for prior in tuning.priors]
-        best = {found.prior: (found.best, found.settings) for found in outcomes if found.best is not None}
+        best = _best(outcomes)
         _report(search, outcomes, quiet=choices.json == "-")
         if best and not (requests or failed):
             study = fresh_study(tuning, best, request.seeds, request.episodes)

@@ -8,10 +8,13 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import torch
 
-from esp_cli.studies.scheduler import Status, makespan
+from esp_cli.files.formatting import format_count
+from esp_cli.studies.run_set import Cell, RunSet
+from esp_cli.studies.scheduler import makespan
 from esp_cli.studies.study import StudyFolder
 from esp_cli.training.build import PolicyController, build_environment, build_learner, generators, play
 from esp_cli.training.config import RunConfig
@@ -31,16 +34,32 @@ class Cost:
     evaluation_s: float  # for its final evaluation
 
 
+# "finished" also where another study has the run; "twin" where another run of this one trains the same
+RunStatus = Literal["waiting", "finished", "twin"]
+
+
 @dataclass(frozen=True)
 class RunForecast:
-    """What is left of one run, or of all trials of a search with one kind of prior."""
+    """What is left of one run, or of a search and what judges it."""
 
     name: str
-    status: Status  # "finished" also where another study has the run, or another run of this one trains the same
+    status: RunStatus
+    state: str  # the same in words, and how far it is
     steps: int  # environment steps per seed of the whole run
     step: int  # those that are done
     num_seeds: int
     seconds: float  # that are left, on one thread
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """Runs that are tuned and judged: of each that is left, which share of its training is."""
+
+    trial: RunConfig  # all trials are taken to cost what this one does, and none to be pruned
+    final: RunConfig  # the same of the runs that judge
+    count: int  # of runs, done and left
+    trials_left: Sequence[float]
+    finals_left: Sequence[float]  # these are evaluated too
 
 
 @dataclass(frozen=True)
@@ -61,39 +80,49 @@ def forecast_study(
     """Measure what is left of a study, whose folder need not exist; runs that cost the same are measured once."""
     known, runs, unlike = dict[str, Cost](), list[RunForecast](), folder.unlike(folder.study.cells)
     for cell in folder.study.cells:
-        config, step = cell.config, folder.progress(cell)[0]
-        if folder.is_finished(cell) or cell not in unlike or folder.find_twin(cell, others) is not None:
-            runs.append(RunForecast(cell.name, "finished", config.steps, config.steps, len(config.seeds), 0))
+        config, step, left = cell.config, folder.progress(cell)[0], 0.0
+        status: RunStatus
+        if folder.is_finished(cell) or folder.find_twin(cell, others) is not None:
+            status, step, state = "finished", config.steps, "finished"
+        elif cell not in unlike:
+            status, state = "twin", f"like {next(first.name for first in unlike if first.config == config)}"
         else:
+            status, state = "waiting", f"at {format_count(step)}" if step else "new"
             cost = _cost(config, folder.study.episodes, known)
             left = cost.training_s * (1 - step / config.steps) + cost.evaluation_s
-            runs.append(RunForecast(cell.name, "waiting", config.steps, step, len(config.seeds), left))
+        runs.append(RunForecast(cell.name, status, state, config.steps, step, len(config.seeds), left))
         listener(len(runs))
-    left_s = [run.seconds for run in runs if run.status != "finished"]
+    left_s = [run.seconds for run in runs if run.status == "waiting"]
     return Forecast(folder.study.title, folder.path, jobs, makespan([], left_s, jobs), sum(left_s), tuple(runs))
 
 
 def forecast_tuned(
-    title: str,
-    out: Path,
-    pairs: Mapping[str, tuple[RunConfig, RunConfig]],
-    counts: tuple[int, int],
-    episodes: int,
-    jobs: int,
-    listener: Callable[[int], object],
+    title: str, out: Path, searches: Mapping[str, Tuned], episodes: int, jobs: int, listener: Callable[[int], object]
 ) -> Forecast:
-    """Measure runs that are tuned and judged: by name a trial and a run that judges, and how many there are of each.
-
-    All trials are taken to cost what this one does, and none to be pruned.
-    """
-    known, runs, (trials, judged) = dict[str, Cost](), list[RunForecast](), counts
-    for name, (trial, last) in pairs.items():
-        tried, final = _cost(trial, episodes, known), _cost(last, episodes, known)
-        seconds = trials * tried.training_s + judged * (final.training_s + final.evaluation_s)
-        runs.append(RunForecast(name, "waiting", trial.steps, 0, len(trial.seeds), seconds))
+    """Measure what is left of searches, by name, and of the runs that judge once all trials have ended."""
+    known, runs, tried, judged = dict[str, Cost](), list[RunForecast](), list[float](), list[float]()
+    for name, one in searches.items():
+        trials, finals = list[float](), list[float]()
+        if one.trials_left:
+            cost = _cost(one.trial, episodes, known)
+            trials = [cost.training_s * share for share in one.trials_left]
+        if one.finals_left:
+            cost = _cost(one.final, episodes, known)
+            finals = [cost.training_s * share + cost.evaluation_s for share in one.finals_left]
+        status: RunStatus = "waiting" if trials or finals else "finished"
+        state = f"{one.count - len(trials) - len(finals)} of {one.count} finished" if trials or finals else status
+        seconds = sum(trials) + sum(finals)
+        runs.append(RunForecast(name, status, state, one.trial.steps, 0, len(one.trial.seeds), seconds))
+        tried += trials
+        judged += finals
         listener(len(runs))
-    core_seconds = sum(run.seconds for run in runs)
-    return Forecast(title, out, jobs, core_seconds / jobs, core_seconds, tuple(runs))
+    seconds = makespan([], tried, jobs) + makespan([], judged, jobs)
+    return Forecast(title, out, jobs, seconds, sum(tried) + sum(judged), tuple(runs))
+
+
+def shares_left(folder: RunSet, cells: Sequence[Cell]) -> list[float]:
+    """Return of each run that is not finished which share of its training is left."""
+    return [1 - folder.progress(cell)[0] / cell.config.steps for cell in cells if not folder.is_finished(cell)]
 
 
 def _cost(config: RunConfig, episodes: int, known: dict[str, Cost]) -> Cost:

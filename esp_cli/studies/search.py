@@ -13,11 +13,14 @@ Layout::
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
+import shutil
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from threading import Lock
 from typing import Any
 
@@ -80,18 +83,33 @@ class Search(RunSet):
     @classmethod
     def create(cls, path: Path, tuning: Tuning) -> Search:
         """Make the folder, or go on with the one that is there, whose budget may grow; refuse another one."""
-        cls.refuse_foreign(path)
+        cls._refuse_other(path, tuning)
         path.mkdir(parents=True, exist_ok=True)
-        file = path / cls.document
+        TUNING_FORMAT.write(path / cls.document, tuning.model_dump(mode="json"))
+        return cls(path, tuning)
+
+    @classmethod
+    @contextlib.contextmanager
+    def looked_at(cls, path: Path, tuning: Tuning) -> Iterator[Search]:
+        """Yield what `create` makes of a folder, in which nothing is written: a copy of its record is read."""
+        cls._refuse_other(path, tuning)
+        with TemporaryDirectory() as scratch:
+            if (path / JOURNAL).is_file():
+                shutil.copy(path / JOURNAL, scratch)
+            search = cls(Path(scratch), tuning)
+            search.path = path
+            yield search
+
+    @classmethod
+    def _refuse_other(cls, path: Path, tuning: Tuning) -> None:
+        cls.refuse_foreign(path)
         if cls.is_one(path):
-            there = TUNING_FORMAT.parse(file, Tuning)
+            there = TUNING_FORMAT.parse(path / cls.document, Tuning)
             same = {"budget": there.budget, "command": there.command}
             if tuning.model_copy(update=same) != there or tuning.budget < there.budget:
                 raise UserError(
                     f"{path} holds another tuning; go on with it by '{there.command}', or choose another --out"
                 )
-        TUNING_FORMAT.write(file, tuning.model_dump(mode="json"))
-        return cls(path, tuning)
 
     def _study(self, storage: Any, prior: str) -> Any:
         pruner = optuna.pruners.SuccessiveHalvingPruner(

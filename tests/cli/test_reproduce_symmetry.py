@@ -7,9 +7,12 @@ import pytest
 
 from esp_cli import app
 from esp_cli.studies.study import StudyFolder
+from esp_cli.studies.symmetry import Trials
 from esp_cli.training import trainer
 from tests.cli.running import TINY_OPTIONS, esp, refused
 from tests.forks import fork, killed, said, wait
+from tests.studies.small_studies import write_run
+from tests.studies.test_symmetry import benchmark, write_trials
 
 SMALL = ("reproduce", "symmetry", "--tasks", "navigation", "--budget", "2", "--seeds", "2", "--episodes", "4")
 STEPS = ("--steps", "500")
@@ -23,6 +26,22 @@ def test_a_dry_run_states_the_cost_of_each_method_and_makes_nothing(tmp_path: Pa
     assert found["core_seconds"] == pytest.approx(sum(run["seconds"] for run in found["runs"]))
     assert "2 trials of each, and the run that judges it: " in esp(*words).stdout
     assert not (tmp_path / "s").exists()
+    assert "is not empty and no study" in refused(*words, "--out", Path(__file__).parent)
+
+
+def test_a_dry_run_in_a_folder_counts_what_is_left(tmp_path: Path) -> None:
+    asked = benchmark(budget=2)
+    write_trials(tmp_path / "s", asked, {})
+    words = ("reproduce", "symmetry", "--tasks", "navigation", "--methods", "plain,ESP", "--budget", "2", "--seeds", 4)
+    words += ("--episodes", 4, "--out", tmp_path / "s", "--dry-run", "--json", "-")
+    found = json.loads(esp(*words).stdout)
+    assert [run["state"] for run in found["runs"]] == ["2 of 3 finished"] * 2
+    fresh = StudyFolder.create(tmp_path / "s" / "fresh", asked.judged(Trials.open(tmp_path / "s")))
+    for cell in fresh.study.cells:
+        write_run(fresh, cell, [[-1.0] * 4], [-1.0] * 4)
+    found = json.loads(esp(*words).stdout)
+    assert ([run["state"] for run in found["runs"]], found["seconds"]) == (["finished"] * 2, 0)
+    assert "has judged navigation-200k-plain already" in refused(*words, "--budget", "3")
 
 
 @pytest.mark.parametrize(

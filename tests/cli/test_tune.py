@@ -26,6 +26,8 @@ def test_a_dry_run_states_the_cost_of_equal_budgets_and_makes_nothing(command: l
     assert "with 3 side by side" in told.stdout
     assert not (tmp_path / "t").exists()
     assert "no such folder" in refused(*command, "--steps", 300, "--dry-run", "--reuse", tmp_path / "nowhere")
+    foreign = refused(*command, "--steps", 300, "--dry-run", "--out", Path(__file__).parent)
+    assert "is not empty and no tuning" in foreign
     planned = json.loads(esp(*command, "--prior", "esp,none", "--steps", 300, "--dry-run", "--json", "-").stdout)
     assert [one["name"] for one in planned["runs"]] == ["30 trials, prior esp", "30 trials, prior none"]
     assert planned["core_seconds"] == pytest.approx(sum(run["seconds"] for run in planned["runs"]))
@@ -75,6 +77,13 @@ def test_a_search_goes_from_a_command_to_a_preset_and_a_study_on_fresh_seeds(com
     grown = [*words, "--budget", 9, "--episodes", 8]
     assert f"{out / 'fresh'} holds another study; go on with it by 'esp tune" in refused(*grown)
     assert len(list((out / "trials").iterdir())) == 2, "nothing is trained for a study that is refused"
+    left = json.loads(esp(*words, "--dry-run", "--json", "-").stdout)
+    assert [run["state"] for run in left["runs"]] == ["finished"]
+    assert (left["core_seconds"], left["seconds"]) == (0, 0)
+    more = json.loads(esp(*words, "--budget", 3, "--dry-run", "--json", "-").stdout)
+    assert more["runs"][0]["state"].endswith(" of 5 finished")
+    for options in (("--budget", 1), ("--trial-seeds", 2)):
+        assert "holds another tuning; go on with it by" in refused(*words, *options, "--dry-run")
     again = esp(*words)
     assert "2 runs, 2 of them finished" in again.stderr
     assert f"next: esp report {out / 'fresh'}" in again.stderr
