@@ -45,14 +45,15 @@ def write_report(material: Material, out: Path, style: Style = "screen") -> list
     """Write a report into a folder; return its files: page, Markdown, pictures and results."""
     if not material.curves:
         raise UserError("no run of this study has an evaluation yet; run it first, or wait a little")
-    _refuse_foreign(out)
-    out.mkdir(parents=True, exist_ok=True)
     # Names in this folder are the program's own: links there are replaced, where drawing would follow them.
     with TemporaryDirectory() as scratch:
         curves = draw_curves(material, Path(scratch) / CURVES, style=style)
         pictures = [curves, *draw_variants(material.results, Path(scratch), style)]
         images = [(picture.png.stem, data_uri(picture.svg.read_bytes(), "image/svg+xml")) for picture in pictures]
-        for file in sorted(Path(scratch).iterdir()):
+        drawn = sorted(Path(scratch).iterdir())
+        _refuse_foreign(out, [MARKDOWN, RESULTS, PAGE, *(file.name for file in drawn)])
+        out.mkdir(parents=True, exist_ok=True)
+        for file in drawn:
             replace_file(out / file.name, file.read_bytes())
     tables, study = all_tables(material.results), material.study
     named = {material.runs[cell.name]: (f"{cell.panel}: {cell.variant}", cell.config) for cell in study.cells}
@@ -112,10 +113,9 @@ def template(name: str) -> Template:
     return Environment(loader=folder, autoescape=True, trim_blocks=True, lstrip_blocks=True).get_template(name)
 
 
-def _refuse_foreign(out: Path) -> None:
+def _refuse_foreign(out: Path, names: Sequence[str]) -> None:
     """Refuse a folder whose files of these names are not of a report."""
-    own = (MARKDOWN, RESULTS, PAGE, f"{CURVES}.png", f"{CURVES}.svg")
-    foreign = next((out / name for name in own if os.path.lexists(out / name)), None)
+    foreign = next((out / name for name in names if os.path.lexists(out / name)), None)
     if foreign is not None and not RESULTS_FORMAT.is_one(out / RESULTS):
         raise UserError(f"{foreign} is not of a report by esp; move it away, or write the report to another folder")
 

@@ -111,12 +111,12 @@ def test_a_study_that_has_not_begun_has_no_report(tmp_path):
         write_report(Material(made.study, made.results, {}, {}), tmp_path / "out")
 
 
-@pytest.mark.parametrize("name", ["report.md", "results.json", "report.html", "curves.png"])
+@pytest.mark.parametrize("name", ["report.md", "results.json", "report.html", "curves.png", "curves.pdf"])
 def test_a_report_of_somebody_else_is_not_replaced(tmp_path, name):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / name).write_text("mine")
     with pytest.raises(ValueError, match=f"{name} is not of a report by esp; move it away"):
-        write_report(material(tmp_path), tmp_path / "out")
+        write_report(material(tmp_path), tmp_path / "out", "paper")
     assert {file.name: file.read_text() for file in (tmp_path / "out").iterdir()} == {name: "mine"}
     (tmp_path / "out" / name).unlink()
     for _ in range(2):
