@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import itertools
 import json
 import math
 import os
@@ -23,12 +24,12 @@ from esp_cli.files.formatting import escaped, format_count, format_interval, for
 from esp_cli.files.opening import read_regular
 from esp_cli.files.writing import replace_file
 from esp_cli.policies.loading import TrainedPolicy
-from esp_cli.policies.statistics import steps_to_threshold
+from esp_cli.policies.statistics import CONFIDENCE, steps_to_threshold
 from esp_cli.reporting.collect import Material
 from esp_cli.reporting.figures import Style
 from esp_cli.reporting.results import MIN_SEEDS_TO_RANK, RESULTS_FORMAT, CellResult, Results, Side
 from esp_cli.reporting.study_figures import draw_curves, draw_variants
-from esp_cli.reporting.tables import all_tables, markdown_text
+from esp_cli.reporting.tables import NOT_RUN, all_tables, markdown_text
 from esp_cli.studies.kinds import kind_of
 from esp_cli.training.folder_names import POLICY
 from esp_envs.errors import UserError
@@ -162,9 +163,10 @@ def _outcome(material: Material) -> list[str]:
     left_out = [f"Not compared, since a seed stopped: {'; '.join(stopped)}."] if stopped else []
     if len(pairs) == 1 and len(finished) == len(results.cells):
         both = pairs[0]
-        return [_returns(results, *both), _verdict(*both), *_steps(material, *both)]
+        return [_returns(results, *both), _verdict(*both), *_too_few(pairs), *_steps(material, *both)]
     if pairs and kind_of(results.kind).benchmark:
-        return [_ranking(panel, results) for panel in dict.fromkeys(cell.panel for cell, _ in pairs)] + left_out
+        ranked = [_ranking(panel, results) for panel in dict.fromkeys(cell.panel for cell, _ in pairs)]
+        return [*ranked, *_too_few(pairs), *left_out]
     texts = _count(pairs) if pairs else [_returns(results, cell) for cell in finished[:2]]
     return [*texts, *left_out] or ["No run has a return yet."]
 
@@ -178,15 +180,15 @@ def _ranking(panel: str, results: Results) -> str:
     """State which method of a panel is highest, and which are ahead of the reference or behind it."""
     own = [cell for cell in results.cells if cell.panel == panel and not _has_stopped(cell)]
     cells = [(cell, cell.summary) for cell in own if cell.summary is not None]
+    missing = ", ".join(cell.variant for cell in own if cell.summary is None)
     if not cells:
         return f"{panel}: a seed of every method stopped, so none is ranked."
     iqm, best = max((summary.iqm.value, cell.variant) for cell, summary in cells if summary.iqm)
     sides = {side: [c.variant for c, s in cells if s.gap is not None and s.gap.ahead == side] for side in _VERDICTS}
     first = next(cell.variant for cell in results.cells if cell.panel == panel and cell.reference is None)
     counts = "; ".join(f"{_VERDICTS[side][3:]} {first}: {', '.join(names)}" for side, names in sides.items() if names)
-    return (
-        f"{panel}: {best} has the highest IQM, {iqm:.2f}; after Holm's correction, {counts or 'nothing is compared'}."
-    )
+    counts = f"{counts or 'nothing is compared'}{missing and f'; not finished: {missing}'}"
+    return f"{panel}: {best} has the highest IQM, {iqm:.2f}; after Holm's correction, {counts}."
 
 
 def _returns(results: Results, *cells: CellResult) -> str:
@@ -211,8 +213,23 @@ def _verdict(cell: CellResult, other: CellResult) -> str:
         return f"{cell.variant} and {other.variant} differ by {gap.difference.value:+.2f} with every seed."
     if gap is None or gap.ahead is None:
         return "There is no interval of the difference, so this tells nothing for sure; take three seeds or more."
-    interval = f"the difference is {gap.difference.value:+.2f}, 95 % interval {format_interval(gap.difference.ci95)}"
-    return f"{cell.variant} {_VERDICTS[gap.ahead]} {other.variant}: {interval}."
+    test = f"p = {gap.holm:.3f} by the rank-sum test" if gap.holm is not None else ""
+    by = test or f"95 % interval {format_interval(gap.difference.ci95)}"
+    return (
+        f"{cell.variant} {_VERDICTS[gap.ahead]} {other.variant}: the difference is {gap.difference.value:+.2f}, {by}."
+    )
+
+
+def _too_few(pairs: Sequence[tuple[CellResult, CellResult]]) -> list[str]:
+    """Say where the seeds are so few that the rank-sum test tells nothing apart, however large a difference is."""
+    tested = [pair for pair in pairs if (one := pair[0].summary) and one.gap and one.gap.holm is not None]
+    most = max(Counter(cell.panel for cell, _ in tested).values(), default=0)
+    seeds = min((len(one.seeds) for pair in tested for one in pair), default=0)
+    enough = next(n for n in itertools.count(1) if most * 2 / math.comb(2 * n, n) <= 1 - CONFIDENCE)
+    if seeds >= enough:
+        return []
+    few = f"With {seeds} seeds the rank-sum test tells nothing apart here, however large a difference is"
+    return [f"{few}; take {enough} seeds or more."] if tested else []
 
 
 def _steps(material: Material, cell: CellResult, other: CellResult) -> list[str]:
@@ -236,7 +253,10 @@ def _reached(results: Results, threshold: float) -> str:
     for cell in results.cells:
         of_mean = next((p.of_mean for p in cell.steps_to if math.isclose(p.threshold, threshold, abs_tol=1e-4)), None)
         name = f"{cell.variant} ({cell.panel})" if several else cell.variant
-        firsts[name] = "never" if of_mean is None else f"after {format_count(of_mean)} steps"
+        whole = cell.status == "finished" and (cell.at is None or cell.step >= cell.steps)
+        short = "never" if whole else f"not up to {format_count(cell.step)} steps"
+        not_reached = NOT_RUN if cell.status == "not run" else short
+        firsts[name] = not_reached if of_mean is None else f"after {format_count(of_mean)} steps"
     return f"The mean over seeds first has {threshold:g}: {', '.join(map(' '.join, firsts.items()))}."
 
 

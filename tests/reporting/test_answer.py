@@ -1,5 +1,6 @@
 """The answer of a report: sentences that are made from the numbers."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -67,6 +68,12 @@ def test_the_steps_at_a_threshold_that_was_asked_for_are_told(tmp_path: Path) ->
         write_run(folder, cell, [[-200.0] * 3, [end] * 3], [end] * 3)
     *_, told = answer(collect_study(folder, thresholds=[-125.0]), [-125.0])
     assert told == "The mean over seeds first has -125: MAPPO never, MAPPO-ESP after 100 steps."
+    (folder.path / "runs" / folder.study.cells[0].name / "policy.safetensors").unlink()
+    *_, told = answer(collect_study(folder, thresholds=[-125.0]), [-125.0])
+    assert told.endswith(": MAPPO not up to 100 steps, MAPPO-ESP after 100 steps.")
+    shutil.rmtree(folder.path / "runs" / folder.study.cells[1].name)
+    *_, told = answer(collect_study(folder, thresholds=[-125.0]), [-125.0])
+    assert told.endswith(": MAPPO not up to 100 steps, MAPPO-ESP not run.")
 
 
 def test_runs_that_differ_alike_with_every_seed_need_no_more_seeds(tmp_path: Path) -> None:

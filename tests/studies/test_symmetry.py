@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -178,13 +179,19 @@ def test_the_report_corrects_for_the_number_of_methods(tmp_path: Path) -> None:
     assert esp.normalised_area.mean == pytest.approx((-200 - 148.5) / 2 / 100 + 2)  # 0 is -200, 1 is -100
     assert answer(material) == [
         "navigation, 200k: ESP has the highest IQM, -148.50; after Holm's correction, not told apart from plain: ESP, "
-        "copies."
+        "copies.",
+        "With 4 seeds the rank-sum test tells nothing apart here, however large a difference is; take 5 seeds or more.",
     ]
     table = TABLES["comparison"](material.results)
     row = dict(zip(table.headings, table.rows[1], strict=True))
     assert (row["over all pairs>"], row["p, corrected>"]) == ("1.00", "0.057")
     alone = material.results.model_copy(update={"cells": material.results.cells[:2]})
     assert summarised(alone).cells[1].summary.gap.ahead == "ahead", "2 / 70 is below 5 %"
+    _, verdict, *steps = answer(replace(material, results=summarised(alone)))
+    assert verdict == "ESP is better than plain: the difference is +30.00, p = 0.029 by the rank-sum test."
+    assert not any("take" in text for text in steps)
+    folder.evaluation_path(folder.study.cells[2]).unlink()
+    assert answer(collect_study(folder))[0].endswith(", better than plain: ESP; not finished: copies.")
 
 
 def test_another_learner_has_its_own_space_and_trials_as_long_as_what_judges() -> None:
