@@ -183,8 +183,8 @@ def _compared_at(curves: Sequence[RunCurve], at: Sequence[int]) -> tuple[int, ..
 
 
 def _alike(curves: Sequence[RunCurve], step: int) -> bool:
-    """Whether the evaluations nearest to a step, of the runs that got there, are about equally far on."""
-    ends = [reached.last_step for curve in curves if (reached := curve.until(step)) is not None]
+    """Whether the evaluations nearest to a step, of the runs that got there, are about as far on as it is."""
+    ends = [step, *(reached.last_step for curve in curves if (reached := curve.until(step)) is not None)]
     return max(ends) - min(ends) <= _LIKE * max(ends)
 
 

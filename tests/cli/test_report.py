@@ -95,9 +95,9 @@ def test_page_markdown_results_and_terminal_compare_at_the_same_step(finished, p
     )
     assert f"```sh\n{command}\n```" in markdown
     assert "'" in command, "a path with a space is quoted"
-    at = esp("report", f"short={short}", f"ESP={finished}", "--at", "50", "--mode", "stochastic", "--out", out)
-    assert "navigation, 50" in at.stdout
-    assert "--at 50 --mode stochastic --out " in (out / "report.md").read_text()
+    at = esp("report", f"short={short}", f"ESP={finished}", "--at", "100", "--mode", "stochastic", "--out", out)
+    assert "navigation, 100" in at.stdout
+    assert "--at 100 --mode stochastic --out " in (out / "report.md").read_text()
 
 
 def test_figures_for_papers_are_a_column_wide_with_embedded_letters(finished, plain, tmp_path):

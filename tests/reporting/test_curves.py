@@ -87,6 +87,8 @@ def test_runs_are_compared_where_all_were_evaluated():
         gathered([often, seldom])
     with pytest.raises(UserError, match=r"not evaluated at like steps near 20k: .*; give an --at near which all"):
         gathered([often, seldom], at=[20_000])
+    with pytest.raises(UserError, match=r"not evaluated at like steps near 4k: often at 0, 6\.4k, "):
+        gathered([often], at=[4000])
     near = replace(seldom, steps=np.array([0, 6500]), trained=40_000)
     found = compare([often, near], [], [])
     # the last step at which both have an evaluation within a tenth: 6.5k of one, 6.4k of the other
