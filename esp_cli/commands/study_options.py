@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 def parse_names(items: Sequence[str] | None, known: Collection[str] = ()) -> tuple[str, ...] | None:
     """Read names that are repeated or separated by commas: ["mappo,qmix"] -> ("mappo", "qmix").
 
-    Names that are `known` may have ", " in them; of those that fit, the longest is taken.
+    Names that are `known` may have ", " in them; of those that fit, the longest is taken. "a,b" is two names.
     """
     names: list[str] = []
     for item in items or ():
-        parts = [part.strip() for part in item.split(",") if part.strip()]
+        parts = [part for part in item.split(",") if part.strip()]
         while parts:
-            end = next((k for k in range(len(parts), 1, -1) if ", ".join(parts[:k]) in known), 1)
-            names.append(", ".join(parts[:end]))
+            end = next((k for k in range(len(parts), 1, -1) if ",".join(parts[:k]).strip() in known), 1)
+            names.append(",".join(parts[:end]).strip())
             del parts[:end]
     if items and not names:
         raise UserError(f"'{' '.join(items)}' names nothing; name something, or leave the option out")

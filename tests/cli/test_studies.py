@@ -19,6 +19,7 @@ from esp_cli.studies.engine import Job, LocalEngine
 from esp_cli.studies.kinds import KINDS
 from esp_cli.studies.scheduler import Scheduler
 from esp_cli.studies.study import StudyFolder
+from esp_cli.studies.symmetry import METHODS
 from esp_cli.training import trainer
 from esp_cli.training.metrics import read_metrics
 from esp_envs.errors import UserError
@@ -37,8 +38,10 @@ def test_names_and_steps_are_read_from_lists() -> None:
     assert parse_names(None) is None
     with pytest.raises(ValueError, match="',,' names nothing; name something, or leave the option out"):
         parse_names([",,"])
-    names = parse_names(["none,rot90,rot90, rot180", "C4,drawn"], KINDS["ablate-transforms"].variants)
+    names = parse_names(["none,rot90,rot90, rot180", "C4, drawn"], KINDS["ablate-transforms"].variants)
     assert names == ("none", "rot90", "rot90, rot180", "C4, drawn")
+    assert parse_names(["plain,sets,ESP"], METHODS) == ("plain", "sets", "ESP")
+    assert parse_names(["plain, sets, ESP"], METHODS) == ("plain", "sets, ESP")
     steps = parse_study_steps(["500k,formation=1M", "3M"])
     assert steps == ((None, 500_000), ("formation", 1_000_000), (None, 3_000_000))
     with pytest.raises(ValueError, match="'soon' is not a number of steps"):
