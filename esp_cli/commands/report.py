@@ -74,7 +74,7 @@ def report(
     options.register_named(task, algo, network)
     limits = threshold or []
     options.check_finite("--threshold", *limits)
-    _refuse_tuning(runs[0])
+    _refuse_trials(Path(runs[0]))
     if StudyFolder.is_one(Path(runs[0])):
         if len(runs) > 1 or at or plot:
             raise UserError("a study is reported by itself: leave out the other runs, --at and --plot")
@@ -123,14 +123,18 @@ def _side_by_side(
     return collect_runs(curves, command, mode or "greedy", steps, thresholds)
 
 
-def _refuse_tuning(path: str) -> None:
-    """Refuse the folder of a tuning; that of its report has a file of this name too."""
+def _refuse_trials(path: Path) -> None:
+    """Refuse the folder of a tuning, whose report has a file of this name too, and that of a benchmark's trials."""
+    from esp_cli.studies.kinds import TRIALS
+    from esp_cli.studies.study import StudyFolder
     from esp_cli.studies.tuning import TUNING_FORMAT
     from esp_cli.training.folder_names import FRESH, TUNING
 
-    if TUNING_FORMAT.is_one(Path(path) / TUNING):
-        fresh = shlex.quote(str(Path(path) / FRESH))
+    fresh = shlex.quote(str(path / FRESH))
+    if TUNING_FORMAT.is_one(path / TUNING):
         raise UserError(f"{path} is a tuning with a report of its own; report its study by: esp report {fresh}")
+    if StudyFolder.is_one(path) and StudyFolder.open(path).study.kind == TRIALS:
+        raise UserError(f"{path} has trials alone; report the study that judges them by: esp report {fresh}")
 
 
 def _write_page(material: Material, out: Path | None, films: bool, style: Literal["screen", "paper"]) -> None:

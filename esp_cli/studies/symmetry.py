@@ -22,7 +22,7 @@ from esp_cli.files.formatting import file_name, format_exactly
 from esp_cli.files.writing import replace_file
 from esp_cli.prior.config import of_no_use_to
 from esp_cli.studies.catalogue import Request, refuse_other_tasks, refuse_unknown_or_twice, refuse_varied, settings_of
-from esp_cli.studies.kinds import KINDS, Settings
+from esp_cli.studies.kinds import KINDS, TRIALS, Settings
 from esp_cli.studies.run_set import Cell
 from esp_cli.studies.study import Study, StudyFolder
 from esp_cli.training.build import build_learner
@@ -263,7 +263,7 @@ class Benchmark:
     @property
     def trials(self) -> Study:
         """The plan of the trials of all methods on all tasks."""
-        return self._study("symmetry-trials", self.title, chain(*self.trials_of.values()), self.left_out)
+        return self._study(TRIALS, self.title, chain(*self.trials_of.values()), self.left_out)
 
     def scores(self, trials: Trials) -> dict[tuple[str, str], list[float]]:
         """Return by task and method the scores of its trials; one that is not finished counts as 0, for a forecast."""

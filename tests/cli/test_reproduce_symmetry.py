@@ -36,6 +36,7 @@ def test_a_dry_run_in_a_folder_counts_what_is_left(tmp_path: Path) -> None:
     words += ("--episodes", 4, "--out", tmp_path / "s", "--dry-run", "--json", "-")
     found = json.loads(esp(*words).stdout)
     assert [run["state"] for run in found["runs"]] == ["2 of 3 finished"] * 2
+    assert f"report the study that judges them by: esp report {tmp_path}/s/fresh" in refused("report", tmp_path / "s")
     fresh = StudyFolder.create(tmp_path / "s" / "fresh", asked.judged(Trials.open(tmp_path / "s")))
     for cell in fresh.study.cells:
         write_run(fresh, cell, [[-1.0] * 4], [-1.0] * 4)
