@@ -75,11 +75,11 @@ class StudyKind:
 
     @property
     def varies(self) -> set[str]:
-        """The settings that the study sets itself and a user cannot: not those that one variant switches off."""
+        """The settings that the study sets itself and a user cannot: of those in common the kind of prior alone."""
         chosen = {name for settings in self.variants.values() for name in settings}
-        once = {name for name in self.common if any(name not in settings for settings in self.variants.values())}
+        kind = self.common.keys() & {"prior.kind"}  # with another one the title would be of something else
         broken = {f"task.{setting}" for settings in self.breakings.values() for setting in settings}
-        return (chosen - once) | broken | {name for team in self.teams for name in team.settings}
+        return chosen | kind | broken | {name for team in self.teams for name in team.settings}
 
 
 def _team(agents: int, landmarks: int | None) -> Team:

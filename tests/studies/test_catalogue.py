@@ -189,6 +189,8 @@ def test_a_setting_is_without_effect_where_every_run_that_it_concerns_leaves_it_
     [
         ("table1", {"overrides": {"prior.kind": "augment"}}, "prior.kind is what this study varies by itself"),
         ("ablate-transforms", {"overrides": {"prior.copies": "all"}}, "prior.copies is what this study varies"),
+        ("ablate-transforms", {"overrides": {"prior.kind": "none"}}, "prior.kind is what this study varies"),
+        ("ablate-coefficient", {"overrides": {"prior.kind": "none"}}, "prior.kind is what this study varies"),
         ("ablate-breaking", {"overrides": {"navigation.wind": 0.3}}, "navigation.wind is what this study varies"),
         ("table1", {"overrides": {"qmix.gamma": 0.9}}, "--set qmix.gamma concerns no run of this study"),
         ("table1", {"overrides": {"formation.physics": "pymunk"}}, "concerns no run"),
