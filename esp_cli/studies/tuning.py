@@ -179,7 +179,8 @@ def fresh_study(
         cells.append(default)
         number, settings = best.get(prior, (0, {}))
         config = tuning.config(prior, settings, seeds)
-        if config != default.config:  # else the default settings were the best, or nothing was
+        # else the default settings were the best, or nothing was; beside a tuned plain learner the best stand anyway
+        if config != default.config or (prior in best and plain is not None and plain[0] != plain[1]):
             tuned = cell(f"{NAMES[prior]}, tuned (trial {number})", config, plain[1] if plain else default)
             cells.append(tuned)
         if prior == "none":

@@ -209,6 +209,9 @@ def test_tuned_is_compared_with_tuned_and_default_with_default():
         "esp-default": "plain-default",
         "esp-tuned-trial-3": "plain-tuned-trial-2",
     }
+    equal = fresh_study(tuning(), {"esp": (0, {}), "none": (2, slower)}, (0, 1), 4)
+    assert (equal.cells[3].name, equal.cells[3].reference) == ("esp-tuned-trial-0", "plain-tuned-trial-2")
+    assert equal.cells[3].config == equal.cells[2].config, "so that it is trained once"
     alone = fresh_study(tuning(priors=("esp",)), {"esp": (3, faster)}, (0, 1), 4)
     assert {cell.name: cell.reference for cell in alone.cells} == {
         "esp-default": None,
