@@ -77,9 +77,10 @@ def _print(result: FinalEvaluation, policy: str) -> None:
     # of one seed the error is over episodes; of one that stopped there is neither
     rows = [row(mode, own.mean, result.over_episodes.get(mode, own)) for mode, own in policies.items()]
     rows += [row(names[key], value, result.over_episodes[key]) for key, value in result.anchors.items()]
+    stopped = result.greedy.per_seed.count(None)
     title = (
         f"{policy} on {result.task} version {result.task_version} after {console.format_count(result.step)} steps, "
-        f"{len(result.seeds)} seed(s) x {result.episodes} episodes"
+        f"{len(result.seeds)} seed(s){f' ({stopped} stopped)' if stopped else ''} x {result.episodes} episodes"
     )
     over = (
         f"over {result.episodes} episodes of one seed"

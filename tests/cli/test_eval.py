@@ -72,6 +72,7 @@ def test_one_seed_that_stopped_has_no_return(monkeypatch: pytest.MonkeyPatch) ->
     ]
     assert "heuristic nearest" in told.stdout
     assert "metric" not in told.stdout
+    assert "1 seed(s) (1 stopped) x 2 episodes" in " ".join(told.stdout.split())
 
 
 def test_several_seeds_state_their_error_over_seeds_and_say_so(finished: Path) -> None:
