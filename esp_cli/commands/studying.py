@@ -105,10 +105,11 @@ def conclude(
 
         material = collect_study(study, choices.mode, choices.thresholds)
         numbers = material.results.document(statistics=True)
-        console.result(choices.json, numbers, lambda: print_answer(material, full=True))
+        console.result(choices.json, numbers, lambda: print_answer(material, True, choices.thresholds))
         first, *others = (cell.config for cell in study.study.cells)
-        limits = (word for limit in choices.thresholds for word in ("--threshold", f"{limit:g}"))
-        console.note(f"next: {shlex.join(['esp', 'report', str(study.path), *first.own_words(*others), *limits])}")
+        words = [*first.own_words(*others), *(["--mode", choices.mode] if choices.mode else [])]
+        words += [word for limit in choices.thresholds for word in ("--threshold", f"{limit:g}")]
+        console.note(f"next: {shlex.join(['esp', 'report', str(study.path), *words])}")
     refuse_failed(failed, out)
 
 

@@ -43,6 +43,9 @@ def test_all_methods_are_trained_and_compared_as_any_study(tmp_path: Path) -> No
         assert [passed["threshold"] for passed in cell["steps_to"]] == [2.0]
         assert {**result["config"], **cell["config"]}["task_settings.num_agents"] == 2
     assert "FLOPs an action" in first.stdout
+    again = esp(*command, "--mode", "greedy", "--threshold", 0.5)
+    assert f"next: esp report {out} --mode greedy --threshold 0.5" in again.stderr
+    assert "The mean over seeds first has 0.5: mpn " in again.stdout
     report = esp("report", out, "--full")
     assert "stochastic return" in report.stdout, "what this kind of study reports"
     assert (out / "report" / "report.html").exists()
