@@ -174,8 +174,11 @@ def run_cells(
     Of cells that train the same, one is run. `requests` is not empty once the user asks to stop.
     """
     cells = folder.cells_of(study)
-    for cell, twin in folder.adopt_finished(cells, resources.reused):
+    taken = folder.adopt_finished(cells, resources.reused)
+    for cell, twin in taken:
         console.note(f"taking over {twin} as {cell.name}")
+    if resources.reused and not taken and not all(folder.run_path(cell).exists() for cell in cells):
+        console.note("--reuse gives nothing: no run there is finished with the configuration and episodes of one here")
     failed = follow(folder, folder.unlike(cells), resources, requests, progress)
     for cell, twin in folder.adopt_finished(cells, [folder]):
         console.note(f"taking over {twin} as {cell.name}, which trains the same")

@@ -95,6 +95,9 @@ def test_a_study_runs_from_a_command_to_a_page_and_a_small_file(tmp_path: Path) 
     taken = esp(*copied)
     assert taken.stderr.count("taking over") == 2
     assert "2 runs, 2 of them finished" in taken.stderr
+    assert "--reuse gives nothing" not in esp(*copied).stderr, "all is there"
+    fewer = [*TINY[:-1], 2, "--steps", 100, *TINY_OPTIONS, "--out", tmp_path / "fewer", "--reuse", out]
+    assert "--reuse gives nothing: no run there" in esp(*fewer).stderr
     small = tmp_path / "small.json"
     report = esp("report", out, "--films", "--results", small)
     assert [cell.pop("summary")["returns"]["per_seed"] for cell in results["cells"]] == [
@@ -213,6 +216,8 @@ def test_progress_in_a_pipe_says_what_changed_and_a_line_a_minute(tmp_path, caps
         progress.update(scheduler)
         now[0] = 61.0
         progress.update(scheduler)
+        plain.status, plain.step = "evaluating", 200
+        assert whole_status(scheduler).endswith("  ? left")
         plain.status, esp_run.status, esp_run.message = "finished", "failed", "no disk"
         progress.update(scheduler)
     assert capsys.readouterr().err.splitlines() == [
