@@ -14,6 +14,7 @@ from esp_cli import console
 from esp_cli.commands import options
 from esp_cli.commands.counts import parse_count
 from esp_cli.defaults import Mode
+from esp_cli.training.folder_names import FRESH, TUNING
 from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
@@ -124,17 +125,14 @@ def _side_by_side(
 
 
 def _refuse_trials(path: Path) -> None:
-    """Refuse the folder of a tuning, whose report has a file of this name too, and that of a benchmark's trials."""
+    """Refuse the folder of a benchmark's trials or a tuning, whose report has a file of this name too."""
     from esp_cli.studies.kinds import TRIALS
     from esp_cli.studies.study import StudyFolder
     from esp_cli.studies.tuning import TUNING_FORMAT
-    from esp_cli.training.folder_names import FRESH, TUNING
 
-    fresh = shlex.quote(str(path / FRESH))
-    if TUNING_FORMAT.is_one(path / TUNING):
-        raise UserError(f"{path} is a tuning with a report of its own; report its study by: esp report {fresh}")
-    if StudyFolder.is_one(path) and StudyFolder.open(path).study.kind == TRIALS:
-        raise UserError(f"{path} has trials alone; report the study that judges them by: esp report {fresh}")
+    of_benchmark = StudyFolder.is_one(path) and StudyFolder.open(path).study.kind == TRIALS
+    if of_benchmark or TUNING_FORMAT.is_one(path / TUNING):
+        raise UserError(f"{path} holds trials; report what judges them by: esp report {shlex.quote(str(path / FRESH))}")
 
 
 def _write_page(material: Material, out: Path | None, films: bool, style: Literal["screen", "paper"]) -> None:

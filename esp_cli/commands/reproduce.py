@@ -10,6 +10,7 @@ from typer import Argument, Option
 from esp_cli.commands import studying
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
 from esp_cli.console.progress import stop_requests
+from esp_cli.training.folder_names import FRESH
 from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
@@ -55,28 +56,21 @@ def reproduce(
 
 
 def _forecast(benchmark: Benchmark, choices: StudyChoices) -> None:
-    from esp_cli.studies.forecast import Tuned, shares_left
     from esp_cli.studies.study import StudyFolder
     from esp_cli.studies.symmetry import Trials
-    from esp_cli.training.folder_names import FRESH
 
-    out, searches = choices.folder("symmetry"), {}
+    out = choices.folder("symmetry")
     trials, _ = Trials.planned(out, benchmark.trials)
-    study = benchmark.judged(trials)
-    fresh, _ = StudyFolder.planned(out / FRESH, study)
-    for (name, method), own in benchmark.trials_of.items():
-        finals = [cell for cell in study.cells if own[0].name == f"{cell.name}-0"]
-        trial, final = (benchmark.config(name, method, 0, trial=trial) for trial in (True, False))
-        left = shares_left(trials, own), shares_left(fresh, finals)
-        searches[f"{name}: {method}"] = Tuned(trial, final, len(own) + len(finals), *left)
+    study = benchmark.judged(trials, write=False)
+    StudyFolder.planned(out / FRESH, study)
+    groups = {": ".join(pair): own for pair, own in benchmark.trials_of.items()}
     what = f"{benchmark.budget} trials of each, and the run that judges it"
-    studying.forecast_tuned(benchmark.title, out, searches, benchmark.request, choices, what)
+    studying.forecast(StudyFolder(out / FRESH, study), choices, trials, groups, what)
 
 
 def _judge(benchmark: Benchmark, choices: StudyChoices) -> None:
     from esp_cli.studies.study import StudyFolder
     from esp_cli.studies.symmetry import Trials
-    from esp_cli.training.folder_names import FRESH
 
     out = choices.folder("symmetry")
     planned, fresh = benchmark.trials, None
@@ -88,7 +82,6 @@ def _judge(benchmark: Benchmark, choices: StudyChoices) -> None:
         trials = Trials.create(out, planned)
         failed = studying.follow(trials, trials.cells_of(planned), resources, requests)
         if not (requests or failed):
-            benchmark.write_scores(trials)
             study = benchmark.judged(trials)
             fresh = StudyFolder.create(out / FRESH, study)
             failed = studying.run_cells(fresh, study, resources, requests)

@@ -24,7 +24,6 @@ from esp_envs.installed import install
 if TYPE_CHECKING:
     from esp_cli.studies.catalogue import Request
     from esp_cli.studies.engine import Engine
-    from esp_cli.studies.forecast import Forecast, Tuned
     from esp_cli.studies.run_set import Cell, RunSet
     from esp_cli.studies.scheduler import Scheduler
     from esp_cli.studies.study import Study, StudyFolder
@@ -66,11 +65,13 @@ def open_resources(choices: StudyChoices, out: Path, device: str) -> Iterator[Re
 def run_or_forecast(kind: str, request: Request, choices: StudyChoices) -> None:
     """Run and report a study of a kind of `studies.kinds`, or say what it costs, where only that was asked for."""
     from esp_cli.studies.catalogue import plan, without_effect
+    from esp_cli.studies.study import StudyFolder
 
     out, study = choices.folder(kind), plan(kind, request)
     note_without_effect(without_effect(kind, request))
     if choices.dry_run:
-        _forecast(out, study, choices)
+        StudyFolder.planned(out, study)  # refuses the folders that the run would refuse
+        forecast(StudyFolder(out, study), choices, None, {}, "")
     else:
         _run(out, study, choices)
 
@@ -113,45 +114,25 @@ def conclude(
     refuse_failed(failed, out)
 
 
-def _forecast(out: Path, study: Study, choices: StudyChoices) -> None:
-    """Say what a study costs; what the study itself would refuse before its first run is refused."""
-    from esp_cli.studies import forecast
-    from esp_cli.studies.study import StudyFolder
-
-    with open_resources(choices, out, study.cells[0].config.device) as resources:
-        StudyFolder.planned(out, study)  # refuses the folders that the run would refuse
-        with console.TrainingProgress(len(study.cells), description="measure", unit="runs") as progress:
-            folder = StudyFolder(out, study)
-            found = forecast.forecast_study(folder, resources.reused, resources.jobs, progress.update)
-    left = sum(run.status == "waiting" for run in found.runs)
-    _print_forecast(found, choices.json, f"{left} run{'' if left == 1 else 's'} to do")
-
-
-def forecast_tuned(
-    title: str, out: Path, searches: Mapping[str, Tuned], request: Request, choices: StudyChoices, what: str
+def forecast(
+    folder: StudyFolder, choices: StudyChoices, trials: RunSet | None, groups: Mapping[str, Sequence[Cell]], what: str
 ) -> None:
-    """Say `what` is left of searches in a folder, and of the runs that judge."""
-    from esp_cli.studies import forecast
+    """Say what is left of a study, or of trials in groups and of the study that judges them, by `what` for short."""
+    from esp_cli.studies.forecast import forecast_study, forecast_tuned
 
-    with open_resources(choices, out, request.device) as resources:
-        jobs = resources.jobs
-    with console.TrainingProgress(len(searches), description="measure", unit="runs") as progress:
-        found = forecast.forecast_tuned(title, out, searches, request.episodes, jobs, progress.update)
-    _print_forecast(found, choices.json, what)
-
-
-def _print_forecast(found: Forecast, json: str | None, what: str) -> None:
-    """Print `what` is left to do, such as "2 runs to do" and how long it takes."""
-    rows = [
-        (
-            run.name,
-            f"{console.format_count(run.steps)} x {run.num_seeds}",
-            run.state,
-            console.format_duration(run.seconds),
-        )
-        for run in found.runs
-    ]
-    core, side_by_side = map(console.format_duration, (found.core_seconds, found.seconds))
+    cells = folder.study.cells
+    with (
+        open_resources(choices, folder.path, cells[0].config.device) as resources,
+        console.TrainingProgress(len(cells) + len(groups), description="measure", unit="runs") as progress,
+    ):
+        found = forecast_study(folder, resources.reused, resources.jobs, progress.update)
+        if trials is not None:
+            found = forecast_tuned(trials, groups, found, lambda done: progress.update(len(cells) + done))
+    size, duration = console.format_count, console.format_duration
+    rows = [(r.name, f"{size(r.steps)} x {r.num_seeds}", r.status, duration(r.seconds)) for r in found.runs]
+    left = sum(run.seconds > 0 for run in found.runs)
+    what = what or f"{left} run{'' if left == 1 else 's'} to do"
+    core, side_by_side = map(duration, (found.core_seconds, found.seconds))
 
     def show() -> None:
         console.table(("run", "steps x seeds>", "state", "time left>"), rows, title=found.title)
@@ -159,7 +140,7 @@ def _print_forecast(found: Forecast, json: str | None, what: str) -> None:
             f"{what}: {core} on one core, {side_by_side} with {found.jobs} side by side, if nothing else runs here"
         )
 
-    console.result(json, found, show)
+    console.result(choices.json, found, show)
 
 
 def run_cells(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,6 +14,7 @@ from esp_cli.commands import studying
 from esp_cli.commands.options import note_without_effect
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
 from esp_cli.console.progress import stop_requests
+from esp_cli.training.folder_names import FRESH
 from esp_envs.errors import UserError
 from esp_envs.installed import install
 
@@ -57,7 +58,11 @@ def tune(
     tuning = _tuning(request, priors, space, trial_seeds, budget)
     idle = frozenset.intersection(*map(tuning.without_effect, priors))
     note_without_effect([name for name in tuning.overrides if name in idle])
-    (_forecast if choices.dry_run else _tune)(tuning, request, choices)
+    try:
+        from esp_cli.studies.search import Search
+    except ImportError:
+        raise UserError(f"Optuna is not installed: {install('tune')}") from None
+    (_forecast if choices.dry_run else _tune)(Search, tuning, request, choices)
 
 
 def _tuning(request: Request, priors: Sequence[str], space: Path | None, trial_seeds: int, budget: int) -> Tuning:
@@ -92,46 +97,27 @@ def _tuning(request: Request, priors: Sequence[str], space: Path | None, trial_s
     return tuning
 
 
-def _searches() -> type[Search]:
-    try:
-        from esp_cli.studies.search import Search
-    except ImportError:
-        raise UserError(f"Optuna is not installed: {install('tune')}") from None
-    return Search
-
-
-def _best(outcomes: Sequence[Outcome]) -> dict[str, tuple[int, Mapping[str, object]]]:
-    return {found.prior: (found.best, found.settings) for found in outcomes if found.best is not None}
-
-
-def _forecast(tuning: Tuning, request: Request, choices: StudyChoices) -> None:
-    from esp_cli.studies.forecast import Tuned, shares_left
-    from esp_cli.studies.study import StudyFolder
-    from esp_cli.studies.tuning import NAMES, fresh_study
-    from esp_cli.training.folder_names import FRESH
-
-    out, searches = choices.folder("tune"), {}
-    with _searches().looked_at(out, tuning) as search:
-        left = {prior: shares_left(search, [c for c in search.cells if c.panel == prior]) for prior in tuning.priors}
-        best = {} if any(left.values()) else _best([search.outcome(prior) for prior in tuning.priors])
-    study = fresh_study(tuning, best, request.seeds, request.episodes)
-    fresh, _ = StudyFolder.planned(out / FRESH, study, keep=False)
-    for prior, trials in left.items():
-        own = [cell for cell in fresh.unlike(fresh.study.cells) if cell.variant.startswith(f"{NAMES[prior]}, ")]
-        finals = shares_left(fresh, own) + [1.0] * any(left.values())  # the best settings are not known yet
-        configs = tuning.config(prior, {}), tuning.config(prior, {}, request.seeds)
-        count = tuning.budget + len(own) + any(left.values())
-        searches[f"{tuning.budget} trials, prior {prior}"] = Tuned(*configs, count, trials, finals)
-    what = "all trials with the default settings, of which pruning saves about half"
-    studying.forecast_tuned(tuning.title, out, searches, request, choices, what)
-
-
-def _tune(tuning: Tuning, request: Request, choices: StudyChoices) -> None:
+def _forecast(search_type: type[Search], tuning: Tuning, request: Request, choices: StudyChoices) -> None:
     from esp_cli.studies.study import StudyFolder
     from esp_cli.studies.tuning import fresh_study
-    from esp_cli.training.folder_names import FRESH
+    from esp_cli.studies.tuning_space import space_of
 
-    search_type = _searches()
+    out, budget = choices.folder("tune"), tuning.budget
+    with search_type.looked_at(out, tuning) as search:
+        groups = {f"{budget} trials, prior {p}": [c for c in search.cells if c.panel == p] for p in tuning.priors}
+        ended = StudyFolder.is_one(out / FRESH) and all(map(search.is_finished, search.cells))
+        # for the best settings, which are not known yet, the first of the space stands in
+        firsts = {} if ended else {p: next(iter(space_of(tuning.space, p).items())) for p in tuning.priors}
+        best = {p: (budget, {name: tried.corners()[-1]}) for p, (name, tried) in firsts.items()}
+        fresh, _ = StudyFolder.planned(out / FRESH, fresh_study(tuning, best, request.seeds, request.episodes))
+        what = "all trials with the default settings, of which pruning saves about half"
+        studying.forecast(fresh, choices, search, groups, what)
+
+
+def _tune(search_type: type[Search], tuning: Tuning, request: Request, choices: StudyChoices) -> None:
+    from esp_cli.studies.study import StudyFolder
+    from esp_cli.studies.tuning import fresh_study
+
     out, fresh = choices.folder("tune"), None
     judged = out / FRESH
     with (
@@ -144,7 +130,7 @@ def _tune(tuning: Tuning, request: Request, choices: StudyChoices) -> None:
         search = search_type.create(out, tuning)
         failed = studying.follow(search, search.cells, resources, requests)
         outcomes = [search.outcome(prior) for prior in tuning.priors]
-        best = _best(outcomes)
+        best = {found.prior: (found.best, found.settings) for found in outcomes if found.best is not None}
         _report(search, outcomes, quiet=choices.json == "-")
         if best and not (requests or failed):
             study = fresh_study(tuning, best, request.seeds, request.episodes)

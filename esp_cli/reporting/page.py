@@ -213,8 +213,8 @@ def _verdict(cell: CellResult, other: CellResult) -> str:
         return f"{cell.variant} and {other.variant} differ by {gap.difference.value:+.2f} with every seed."
     if gap is None or gap.ahead is None:
         return "There is no interval of the difference, so this tells nothing for sure; take three seeds or more."
-    test = f"p = {gap.holm:.3f} by the rank-sum test" if gap.holm is not None else ""
-    by = test or f"95 % interval {format_interval(gap.difference.ci95)}"
+    interval = f"95 % interval {format_interval(gap.difference.ci95)}"
+    by = interval if gap.holm is None else f"p = {gap.holm:.3f} by the rank-sum test"
     return (
         f"{cell.variant} {_VERDICTS[gap.ahead]} {other.variant}: the difference is {gap.difference.value:+.2f}, {by}."
     )
@@ -222,14 +222,12 @@ def _verdict(cell: CellResult, other: CellResult) -> str:
 
 def _too_few(pairs: Sequence[tuple[CellResult, CellResult]]) -> list[str]:
     """Say where the seeds are so few that the rank-sum test tells nothing apart, however large a difference is."""
-    tested = [pair for pair in pairs if (one := pair[0].summary) and one.gap and one.gap.holm is not None]
-    most = max(Counter(cell.panel for cell, _ in tested).values(), default=0)
-    seeds = min((len(one.seeds) for pair in tested for one in pair), default=0)
-    enough = next(n for n in itertools.count(1) if most * 2 / math.comb(2 * n, n) <= 1 - CONFIDENCE)
-    if seeds >= enough:
-        return []
-    few = f"With {seeds} seeds the rank-sum test tells nothing apart here, however large a difference is"
-    return [f"{few}; take {enough} seeds or more."] if tested else []
+    tested = [cell for cell, _ in pairs if cell.summary and cell.summary.gap and cell.summary.gap.holm is not None]
+    most = max(Counter(cell.panel for cell in tested).values(), default=0)
+    seeds = min((len(cell.seeds) for cell in tested), default=0)
+    enough = next(n for n in itertools.count() if most * 2 / math.comb(2 * n, n) <= 1 - CONFIDENCE)
+    few = f"With {seeds} seeds the rank-sum test can tell nothing apart here; take {enough} seeds or more."
+    return [few] if seeds < enough else []
 
 
 def _steps(material: Material, cell: CellResult, other: CellResult) -> list[str]:
@@ -253,10 +251,9 @@ def _reached(results: Results, threshold: float) -> str:
     for cell in results.cells:
         of_mean = next((p.of_mean for p in cell.steps_to if math.isclose(p.threshold, threshold, abs_tol=1e-4)), None)
         name = f"{cell.variant} ({cell.panel})" if several else cell.variant
-        whole = cell.status == "finished" and (cell.at is None or cell.step >= cell.steps)
-        short = "never" if whole else f"not up to {format_count(cell.step)} steps"
-        not_reached = NOT_RUN if cell.status == "not run" else short
-        firsts[name] = not_reached if of_mean is None else f"after {format_count(of_mean)} steps"
+        ended = cell.status == "finished" and (cell.at is None or cell.step >= cell.steps)
+        never = "never" if ended else f"not up to {format_count(cell.step)} steps" if cell.step else NOT_RUN
+        firsts[name] = never if of_mean is None else f"after {format_count(of_mean)} steps"
     return f"The mean over seeds first has {threshold:g}: {', '.join(map(' '.join, firsts.items()))}."
 
 

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import torch
 
@@ -34,32 +33,18 @@ class Cost:
     evaluation_s: float  # for its final evaluation
 
 
-# "finished" also where another study has the run; "twin" where another run of this one trains the same
-RunStatus = Literal["waiting", "finished", "twin"]
-
-
 @dataclass(frozen=True)
 class RunForecast:
-    """What is left of one run, or of a search and what judges it."""
+    """What is left of one run, or of a group of trials."""
 
     name: str
-    status: RunStatus
-    state: str  # the same in words, and how far it is
+    # such as "new", "at 50k", "5 of 8 finished", "like NAME" where that run trains the same; "finished" also where
+    # another study has the run
+    status: str
     steps: int  # environment steps per seed of the whole run
     step: int  # those that are done
     num_seeds: int
     seconds: float  # that are left, on one thread
-
-
-@dataclass(frozen=True)
-class Tuned:
-    """Runs that are tuned and judged: of each that is left, which share of its training is."""
-
-    trial: RunConfig  # all trials are taken to cost what this one does, and none to be pruned
-    final: RunConfig  # the same of the runs that judge
-    count: int  # of runs, done and left
-    trials_left: Sequence[float]
-    finals_left: Sequence[float]  # these are evaluated too
 
 
 @dataclass(frozen=True)
@@ -78,51 +63,41 @@ def forecast_study(
     folder: StudyFolder, others: Sequence[StudyFolder], jobs: int, listener: Callable[[int], object]
 ) -> Forecast:
     """Measure what is left of a study, whose folder need not exist; runs that cost the same are measured once."""
-    known, runs, unlike = dict[str, Cost](), list[RunForecast](), folder.unlike(folder.study.cells)
+    known, runs, left_s = dict[str, Cost](), list[RunForecast](), list[float]()
+    unlike = folder.unlike(folder.study.cells)
     for cell in folder.study.cells:
         config, step, left = cell.config, folder.progress(cell)[0], 0.0
-        status: RunStatus
         if folder.is_finished(cell) or folder.find_twin(cell, others) is not None:
-            status, step, state = "finished", config.steps, "finished"
+            status, step = "finished", config.steps
         elif cell not in unlike:
-            status, state = "twin", f"like {next(first.name for first in unlike if first.config == config)}"
+            status = f"like {next(first.name for first in unlike if first.config == config)}"
         else:
-            status, state = "waiting", f"at {format_count(step)}" if step else "new"
-            cost = _cost(config, folder.study.episodes, known)
+            status, cost = f"at {format_count(step)}" if step else "new", _cost(config, folder.study.episodes, known)
             left = cost.training_s * (1 - step / config.steps) + cost.evaluation_s
-        runs.append(RunForecast(cell.name, status, state, config.steps, step, len(config.seeds), left))
+            left_s.append(left)
+        runs.append(RunForecast(cell.name, status, config.steps, step, len(config.seeds), left))
         listener(len(runs))
-    left_s = [run.seconds for run in runs if run.status == "waiting"]
     return Forecast(folder.study.title, folder.path, jobs, makespan([], left_s, jobs), sum(left_s), tuple(runs))
 
 
 def forecast_tuned(
-    title: str, out: Path, searches: Mapping[str, Tuned], episodes: int, jobs: int, listener: Callable[[int], object]
+    folder: RunSet, groups: Mapping[str, Sequence[Cell]], judged: Forecast, listener: Callable[[int], object]
 ) -> Forecast:
-    """Measure what is left of searches, by name, and of the runs that judge once all trials have ended."""
-    known, runs, tried, judged = dict[str, Cost](), list[RunForecast](), list[float](), list[float]()
-    for name, one in searches.items():
-        trials, finals = list[float](), list[float]()
-        if one.trials_left:
-            cost = _cost(one.trial, episodes, known)
-            trials = [cost.training_s * share for share in one.trials_left]
-        if one.finals_left:
-            cost = _cost(one.final, episodes, known)
-            finals = [cost.training_s * share + cost.evaluation_s for share in one.finals_left]
-        status: RunStatus = "waiting" if trials or finals else "finished"
-        state = f"{one.count - len(trials) - len(finals)} of {one.count} finished" if trials or finals else status
-        seconds = sum(trials) + sum(finals)
-        runs.append(RunForecast(name, status, state, one.trial.steps, 0, len(one.trial.seeds), seconds))
-        tried += trials
-        judged += finals
+    """Measure what is left of trials, in groups with names, and add what is `judged` once they have ended.
+
+    All trials of a group are taken to cost what its first one does, and none to be pruned.
+    """
+    known, runs, left_s = dict[str, Cost](), list[RunForecast](), list[float]()
+    for name, cells in groups.items():
+        config, left = cells[0].config, [cell for cell in cells if not folder.is_finished(cell)]
+        seconds = _cost(config, 1, known).training_s if left else 0.0
+        own = [seconds * (1 - folder.progress(cell)[0] / config.steps) for cell in left]
+        status = f"{len(cells) - len(left)} of {len(cells)} finished" if left else "finished"
+        runs.append(RunForecast(name, status, config.steps, 0, len(config.seeds), sum(own)))
+        left_s += own
         listener(len(runs))
-    seconds = makespan([], tried, jobs) + makespan([], judged, jobs)
-    return Forecast(title, out, jobs, seconds, sum(tried) + sum(judged), tuple(runs))
-
-
-def shares_left(folder: RunSet, cells: Sequence[Cell]) -> list[float]:
-    """Return of each run that is not finished which share of its training is left."""
-    return [1 - folder.progress(cell)[0] / cell.config.steps for cell in cells if not folder.is_finished(cell)]
+    seconds, core_seconds = makespan([], left_s, judged.jobs) + judged.seconds, sum(left_s) + judged.core_seconds
+    return Forecast(folder.title, folder.path, judged.jobs, seconds, core_seconds, (*runs, *judged.runs))
 
 
 def _cost(config: RunConfig, episodes: int, known: dict[str, Cost]) -> Cost:

@@ -86,10 +86,7 @@ class Scheduler:
                     run.job.kill()
 
     def left_s(self) -> float | None:
-        """Return the seconds until the last run is trained, from what the runs so far took.
-
-        None where none tells, or while a run plays its final evaluation, of which nothing is known.
-        """
+        """Return the seconds until the last run ends, from what the runs so far took; None where that does not tell."""
         costs = [(run, self._seconds_left(run)) for run in self.runs if run.is_active or run.status == "waiting"]
         if any(seconds is None for _, seconds in costs):
             return None
@@ -100,7 +97,7 @@ class Scheduler:
         """Estimate what is left of a run by its own speed, or by that of runs like it."""
         steps = max(0, run.cell.config.steps - run.step)
         if run.status == "evaluating":
-            return None
+            return None  # its final evaluation takes what no training tells
         if run.step and run.trained_s:
             return steps * run.trained_s / run.step
         known = [other for other in self.runs if other.step and other.trained_s]

@@ -11,7 +11,6 @@ import random
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import chain
 from pathlib import Path
 from typing import Self
 
@@ -263,35 +262,28 @@ class Benchmark:
     @property
     def trials(self) -> Study:
         """The plan of the trials of all methods on all tasks."""
-        return self._study(TRIALS, self.title, chain(*self.trials_of.values()), self.left_out)
+        return self._study(TRIALS, self.title, sum(self.trials_of.values(), list[Cell]()), self.left_out)
 
-    def scores(self, trials: Trials) -> dict[tuple[str, str], list[float]]:
-        """Return by task and method the scores of its trials; one that is not finished counts as 0, for a forecast."""
-        return {
-            pair: [score(trials.run_path(cell)) if trials.is_finished(cell) else 0.0 for cell in own]
-            for pair, own in self.trials_of.items()
-        }
+    def judged(self, trials: Trials, write: bool = True) -> Study:
+        """Plan the runs that judge, with each method's best trial, the first of equals; `trials.json` has scores.
 
-    def judged(self, trials: Trials) -> Study:
-        """Plan the runs that judge, with each method's best trial, the first of equals; the first is the reference."""
+        A trial that is not finished counts as 0, for a forecast, which is not to `write`.
+        """
         cells, left_out, firsts = list[Cell](), dict(self.left_out), dict[str, str]()
-        for (name, method), own in self.scores(trials).items():
+        scores = dict[str, list[float | None]]()
+        for (name, method), tried in self.trials_of.items():
+            own = [score(trials.run_path(cell)) if trials.is_finished(cell) else 0.0 for cell in tried]
+            scores[f"{name}: {method}"] = [value if math.isfinite(value) else None for value in own]
             if max(own) == -math.inf:
                 left_out[f"{name}: {method}"] = "a seed stopped in each of its trials"
                 continue
             cell = self._cell(name, method, int(np.argmax(own)), trial=False)
             first = firsts.setdefault(name, cell.name)
             cells.append(cell.model_copy(update={"reference": None if first == cell.name else first}))
+        if write:
+            document = {"draws": draws(self.algorithm, self.budget), "seeds": TRIAL_SEEDS, "scores": scores}
+            replace_file(trials.path / "trials.json", (json.dumps(document, indent=1) + "\n").encode())
         if not cells:
             raise UserError(f"a seed stopped in every trial in {trials.path}, so there is nothing to judge")
         title = "Symmetry in multi-agent learning, each method tuned on equal steps"
         return self._study("symmetry", title, cells, left_out)
-
-    def write_scores(self, trials: Trials) -> None:
-        """Write `trials.json`: what was drawn, and the scores."""
-        scores = {
-            ": ".join(pair): [value if math.isfinite(value) else None for value in own]
-            for pair, own in self.scores(trials).items()
-        }
-        document = {"draws": draws(self.algorithm, self.budget), "seeds": TRIAL_SEEDS, "scores": scores}
-        replace_file(trials.path / "trials.json", (json.dumps(document, indent=1) + "\n").encode())

@@ -179,8 +179,6 @@ def test_runs_of_two_versions_of_a_task_are_refused_and_a_run_states_its_own(fin
 
 def test_the_report_of_a_tuning_is_not_taken_for_a_tuning(tmp_path: Path) -> None:
     TUNING_FORMAT.write(tmp_path / TUNING, {})
-    assert f"is a tuning with a report of its own; report its study by: esp report {tmp_path}/fresh" in refused(
-        "report", tmp_path
-    )
+    assert f"holds trials; report what judges them by: esp report {tmp_path}/fresh" in refused("report", tmp_path)
     (tmp_path / TUNING).write_text("{}")
     assert "is no run folder" in refused("report", tmp_path)

@@ -21,8 +21,12 @@ STEPS = ("--steps", "500")
 def test_a_dry_run_states_the_cost_of_each_method_and_makes_nothing(tmp_path: Path) -> None:
     words = [*SMALL, *STEPS, *TINY_OPTIONS, "--methods", "plain,sets, ESP", "--out", tmp_path / "s", "--dry-run"]
     found = json.loads(esp(*words, "--json", "-").stdout)
-    assert [run["name"] for run in found["runs"]] == ["navigation: plain", "navigation: sets, ESP"]
-    assert {(run["steps"], run["num_seeds"]) for run in found["runs"]} == {(150, 3)}
+    assert {run["name"]: (run["steps"], run["num_seeds"]) for run in found["runs"]} == {
+        "navigation: plain": (150, 3),
+        "navigation: sets, ESP": (150, 3),
+        "navigation-500-plain": (500, 2),
+        "navigation-500-sets-esp": (500, 2),
+    }
     assert found["core_seconds"] == pytest.approx(sum(run["seconds"] for run in found["runs"]))
     assert "2 trials of each, and the run that judges it: " in esp(*words).stdout
     assert not (tmp_path / "s").exists()
@@ -35,13 +39,13 @@ def test_a_dry_run_in_a_folder_counts_what_is_left(tmp_path: Path) -> None:
     words = ("reproduce", "symmetry", "--tasks", "navigation", "--methods", "plain,ESP", "--budget", "2", "--seeds", 4)
     words += ("--episodes", 4, "--out", tmp_path / "s", "--dry-run", "--json", "-")
     found = json.loads(esp(*words).stdout)
-    assert [run["state"] for run in found["runs"]] == ["2 of 3 finished"] * 2
-    assert f"report the study that judges them by: esp report {tmp_path}/s/fresh" in refused("report", tmp_path / "s")
+    assert [run["status"] for run in found["runs"]] == ["finished"] * 2 + ["new"] * 2
+    assert f"report what judges them by: esp report {tmp_path}/s/fresh" in refused("report", tmp_path / "s")
     fresh = StudyFolder.create(tmp_path / "s" / "fresh", asked.judged(Trials.open(tmp_path / "s")))
     for cell in fresh.study.cells:
         write_run(fresh, cell, [[-1.0] * 4], [-1.0] * 4)
     found = json.loads(esp(*words).stdout)
-    assert ([run["state"] for run in found["runs"]], found["seconds"]) == (["finished"] * 2, 0)
+    assert ([run["status"] for run in found["runs"]], found["seconds"]) == (["finished"] * 4, 0)
     assert "has judged navigation-200k-plain already" in refused(*words, "--budget", "3")
 
 

@@ -54,7 +54,7 @@ def test_a_dry_run_states_time_makes_nothing_and_refuses_what_the_run_refuses(tm
     told = esp(*TINY, "--steps", 100, *TINY_OPTIONS, "--out", out, "--dry-run", "--jobs", 2, "--json", plan)
     assert not out.exists()
     found = json.loads(plan.read_text())
-    assert [run["status"] for run in found["runs"]] == ["waiting", "waiting"]
+    assert [run["status"] for run in found["runs"]] == ["new", "new"]
     first, second = (run["seconds"] for run in found["runs"])
     assert found["core_seconds"] == pytest.approx(first + second)
     assert found["seconds"] == pytest.approx(max(first, second))

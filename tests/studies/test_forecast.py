@@ -7,9 +7,11 @@ import pytest
 import torch
 
 from esp_cli.studies import forecast as module
-from esp_cli.studies.forecast import Cost, Tuned, forecast_tuned
+from esp_cli.studies.forecast import Cost, forecast_tuned
 from esp_cli.studies.forecast import forecast_study as forecast
+from esp_cli.studies.run_set import Cell
 from esp_cli.studies.study import StudyFolder
+from esp_cli.studies.symmetry import Trials
 from tests.studies.small_studies import small_study, write_run
 from tests.studies.test_tuning import tuning
 from tests.training.runs import tiny_config
@@ -56,7 +58,7 @@ def test_what_costs_the_same_is_measured_once_and_what_trains_the_same_is_run_on
     study = small_study("ablate-breaking", tasks=("navigation",), variants=methods, breakings=("wind",))
     found = forecast(StudyFolder(tmp_path / "s", study), [], 1, lambda done: None)
     assert probed == ["none", "esp", "esp"]
-    assert {run.name: run.state for run in found.runs if run.status == "twin"} == {
+    assert {run.name: run.status for run in found.runs if not run.seconds} == {
         "navigation-unbroken-mappo-200-measured-weights": "like navigation-unbroken-mappo-200-esp"
     }
     assert found.core_seconds == 8 * 104.0
@@ -68,7 +70,7 @@ def test_a_finished_run_is_not_measured(tmp_path: Path, probed: list[str]) -> No
     plain = folder.study.cells[0]
     write_run(folder, plain, [[-1.0] * 3], [-1.0] * 3)
     found = forecast(folder, [], 2, lambda done: None)
-    assert [run.status for run in found.runs] == ["finished", "waiting"]
+    assert [run.status for run in found.runs] == ["finished", "new"]
     assert (found.seconds, found.core_seconds) == (104.0, 104.0)
     # a study that takes it over sees the same
     other = StudyFolder(tmp_path / "t", small_study())
@@ -78,25 +80,19 @@ def test_a_finished_run_is_not_measured(tmp_path: Path, probed: list[str]) -> No
 
 
 def test_the_forecast_of_a_search_by_hand(tmp_path: Path, probed: list[str]) -> None:
-    """Each prior: 6 trials of 100 s, and two runs of 104 s."""
-    asked = tuning(budget=6)
-
-    def one(prior: str, trials: list[float], finals: list[float]) -> Tuned:
-        return Tuned(asked.config(prior, {}), asked.config(prior, {}, (0, 1, 2, 3)), 8, trials, finals)
-
-    searches = {prior: one(prior, [1.0] * 6, [1.0] * 2) for prior in asked.priors}
-    found = forecast_tuned(asked.title, tmp_path, searches, 2, 2, lambda done: None)
-    assert [run.seconds for run in found.runs] == [6 * 100.0 + 2 * 104.0] * 2
-    assert (found.core_seconds, found.seconds) == (2 * 808.0, 808.0)
-    # with more places than runs, the longest trial and then the longest that judges
-    assert forecast_tuned(asked.title, tmp_path, searches, 2, 99, lambda done: None).seconds == 204.0
-    searches = {"half a trial and what judges": one("esp", [0.5], [1.0] * 2), "nothing": one("none", [], [])}
-    left = forecast_tuned(asked.title, tmp_path, searches, 2, 2, lambda done: None)
-    assert [(run.status, run.state) for run in left.runs] == [
-        ("waiting", "5 of 8 finished"),
-        ("finished", "finished"),
-    ]
-    assert (left.core_seconds, left.seconds) == (258.0, 154.0)
+    """Each prior: 6 trials of 100 s, and then a run of 104 s."""
+    asked, path = tuning(budget=6), tmp_path / "s"
+    cells = {
+        prior: [Cell(name=f"{prior}-{k}", panel=prior, variant=prior, config=asked.config(prior, {})) for k in range(6)]
+        for prior in asked.priors
+    }
+    trials = Trials(path, small_study().model_copy(update={"cells": (*cells["esp"], *cells["none"])}))
+    fresh = StudyFolder(path / "fresh", small_study())
+    for jobs, seconds in ((1, 12 * 100.0 + 208.0), (2, 600.0 + 104.0), (99, 100.0 + 104.0)):
+        judged = forecast(fresh, [], jobs, lambda done: None)
+        found = forecast_tuned(trials, cells, judged, lambda done: None)
+        assert [run.seconds for run in found.runs] == [600.0] * 2 + [104.0] * 2
+        assert (found.core_seconds, found.seconds) == (12 * 100.0 + 208.0, seconds)
 
 
 def test_twice_the_steps_cost_about_twice_the_iterations_and_evaluations(monkeypatch):
