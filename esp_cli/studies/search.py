@@ -55,7 +55,7 @@ class Search(RunSet):
 
     document, runs, noun = TUNING, "trials", "tuning"
 
-    def __init__(self, path: Path, tuning: Tuning) -> None:
+    def __init__(self, path: Path, tuning: Tuning, journal: Path | None = None) -> None:
         super().__init__(path, tuning.title)
         self.tuning = tuning
         keys = [(prior, number) for number in range(tuning.budget) for prior in tuning.priors]
@@ -64,7 +64,7 @@ class Search(RunSet):
         self._begun: dict[str, Any] = {}
         self._spaces = {prior: space_of(tuning.space, prior) for prior in tuning.priors}
         optuna.logging.set_verbosity(optuna.logging.ERROR)
-        journal = path / JOURNAL
+        journal = journal or path / JOURNAL
         mend_last_line(journal)
         try:
             backend = JournalFileBackend(str(journal), lock_obj=Lock())  # no file that a kill would leave behind
@@ -94,11 +94,10 @@ class Search(RunSet):
         """Yield what `create` makes of a folder, in which nothing is written: a copy of its record is read."""
         cls._refuse_other(path, tuning)
         with TemporaryDirectory() as scratch:
+            copy = Path(scratch) / JOURNAL
             if (path / JOURNAL).is_file():
-                shutil.copy(path / JOURNAL, scratch)
-            search = cls(Path(scratch), tuning)
-            search.path = path
-            yield search
+                shutil.copy(path / JOURNAL, copy)
+            yield cls(path, tuning, copy)
 
     @classmethod
     def _refuse_other(cls, path: Path, tuning: Tuning) -> None:
