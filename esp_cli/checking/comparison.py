@@ -125,12 +125,15 @@ def by_distances(
 
 
 def _covariances(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """Return by how much covariances differ, and standard errors, from differences of two runs on each side [M, D]."""
+    """Return by how much covariances differ, and standard errors, from differences of two runs on each side [M, D].
+
+    Variances are left out: rare large chance has large ones.
+    """
     count, both = len(x), x * y
     gap = (x.mT @ x - y.mT @ y) / (2 * count)
     square = (x.square().mT @ x.square() - 2 * both.mT @ both + y.square().mT @ y.square()) / (4 * count)
     error = ((square - gap.square()).clamp_min(0) / count).sqrt()
-    return gap.abs().flatten().double(), error.flatten().double()
+    return gap.fill_diagonal_(0).abs().flatten().double(), error.flatten().double()
 
 
 def _known(*sides: Tensor) -> tuple[list[Tensor], Tensor]:

@@ -31,8 +31,8 @@ from esp_envs.spec import TaskSpec
 
 _FEWEST_WORLDS, _MOST_WORLDS = 64, 256
 _NUMBERS = 1 << 18  # that all worlds together may show their agents at once; with pictures they are fewer
-_SOME, _THESE = 8, 4
-"""Of more elements than `_SOME`, each is first tried in one of so many states; later steps are those of `_THESE`."""
+_SOME, _FOLLOWED = 8, 4
+"""Of more elements than `_SOME`, each is first tried in one of so many states; later steps are those of `_FOLLOWED`."""
 _FURTHER = "holds where play went, but further out {} would differ"
 _TOGETHER = "fields together"
 _HIDDEN = "the state leaves out {}, and later steps do not tell what that does"
@@ -110,8 +110,8 @@ class _Judge:
 
     @cached_property
     def _onwards(self) -> _Pairs | None:
-        steps, start = min(self._later, self._spec.horizon), self._moments[0][0][:, ::_THESE]
-        actions = [action[:, ::_THESE] for _, action in self._moments]
+        steps, start = min(self._later, self._spec.horizon), self._moments[0][0][:, ::_FOLLOWED]
+        actions = [action[:, ::_FOLLOWED] for _, action in self._moments]
 
         def episode() -> Sequence[Visited]:
             if self._spec.masks:  # what is allowed later depends on what was done

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from esp_envs import Items, make
+from esp_envs import Items, UserError, make
 from esp_envs.mpe.predator_prey import chase, circle, flee, out_of_bounds
 from esp_envs.mpe.task import nearest_move
 from tests.envs.playing import episode_return
@@ -153,7 +153,7 @@ def test_anchors(settings: dict[str, object], policy: str, expected: float) -> N
     "settings", [{"prey": "policy"}, {"control": "prey", "prey": "fleeing"}, {"num_predators": 0}, {"prey": "wild"}]
 )
 def test_settings_that_contradict_each_other_are_refused(settings: dict[str, object]) -> None:
-    with pytest.raises(ValueError, match="PredatorPreySettings"):
+    with pytest.raises(UserError, match="predator-prey does not take these settings"):
         make("predator-prey", 1, [0], settings)
 
 
