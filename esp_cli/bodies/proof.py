@@ -28,12 +28,8 @@ _NO_CONSTRAINTS, _NO_SENSORS, _NO_CONTACTS = (
     int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in ("CONSTRAINT", "SENSOR", "CONTACT")
 )
 _NO_LIMITS = int(mujoco.mjtDisableBit.mjDSBL_LIMIT | mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS) | _NO_CONTACTS
-_PARTS: tuple[list[int], ...] = (
-    [2, 3, 5],
-    [2],
-    [],
-    [],
-)  # where (x, y), z, (roll, pitch) and yaw of a joint begin, by type
+_PARTS: tuple[list[int], ...] = ([2, 3, 5], [2], [], [])
+"""Where z, (roll, pitch) and yaw begin behind (x, y) in the degrees of freedom of a joint, by its type."""
 Sample = tuple[Floats, Floats, Floats, Floats]  # qpos, qvel, ctrl and forces on the degrees of freedom
 
 
