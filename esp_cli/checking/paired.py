@@ -209,14 +209,11 @@ class _Pairs:
         # in either half of the worlds: an event that rounding tips in one of them is no breaking
         soon = goes.clone()
         soon[worlds * _LATER_OF_SLOW :] = False
-        halves = [soon & (torch.arange(len(goes), device=goes.device) % 2 == k) for k in (0, 1)]
-        names = [name for name in first if len(first[name]) == len(goes)]
-
-        def judged(name: str, rows: Tensor) -> FieldVerdict | None:
-            return state_by_state(name, *({one: side[one][rows] for one in names} for side in sides))
-
-        verdicts = {name: [judged(name, rows) for rows in halves] for name in names}
-        verdicts |= {f"{name} later": [judged(name, goes)] for name in names}
+        halves = [_kept(sides, soon & (torch.arange(len(goes), device=goes.device) % 2 == k)) for k in (0, 1)]
+        whole = _kept(sides, goes)
+        names = list(whole[0])
+        verdicts = {name: [state_by_state(name, *half) for half in halves] for name in names}
+        verdicts |= {f"{name} later": [state_by_state(name, *whole)] for name in names}
         if drawn := [name for name in names if None in verdicts[name]]:
             verdicts |= self._drawn_later(drawn, transform, first, second)
         least = 0.5 / min(len(self._visited), _LATER_OF_SLOW)
@@ -238,8 +235,7 @@ class _Pairs:
             return {}
         worlds = self._visited[0][0].shape[1]
         goes = _until_an_end(sides, worlds)
-        rows = [{name: side[name][goes] for name in side if len(side[name]) == len(goes)} for side in sides]
-        world = torch.arange(len(goes), device=goes.device)[goes] % worlds
+        rows, world = _kept(sides, goes), torch.arange(len(goes), device=goes.device)[goes] % worlds
         return {name: [by_distances(name, rows, worlds=world)] for name in names}
 
     def _transform(self, element: Element | Shift) -> Transform | Unmoved:
@@ -266,3 +262,8 @@ def _until_an_end(sides: Sequence[Outcomes], worlds: int) -> Tensor:
     """Return which rows [steps x worlds] belong to the first episode of a world on all sides."""
     ended = torch.stack([side["end"].any(1) for side in sides]).any(0).view(-1, worlds)
     return (ended.cumsum(0) == ended).flatten()
+
+
+def _kept(sides: Sequence[Outcomes], rows: Tensor) -> list[Outcomes]:
+    """Return some rows of all fields that have as many; some simulators do not say what is seen at the start."""
+    return [{name: x[rows] for name, x in side.items() if len(x) == len(rows)} for side in sides]

@@ -82,9 +82,8 @@ def check_transitions(
 
 def _plain(x: Tensor) -> Tensor:
     """Return numbers as float32 or int64, and flags as they are, without a graph."""
-    return (
-        x.detach() if x.dtype == torch.bool else x.detach().to(torch.float32 if x.is_floating_point() else torch.int64)
-    )
+    x = x.detach()
+    return x if x.dtype == torch.bool else x.float() if x.is_floating_point() else x.long()
 
 
 def _untold(field: FieldVerdict) -> FieldVerdict:
@@ -148,8 +147,8 @@ class _Half:
         self._mean, self._deviation = outputs.mean((0, 1, 2)), outputs.flatten(0, 2).std(0)
         places = spaces.observation.slices().values()
         self._next = [k for where in places for k in (*range(where.start + 1, where.stop), where.start)]
-        functions = torch.cat([controls(fitted), self._products(fitted)], -1)
-        self._predict = Predictor(spaces, fitted, self._targets(fitted), functions)
+        targets, products = self._true(fitted).tensor_split([2 * self._width], -1)
+        self._predict = Predictor(spaces, fitted, targets, torch.cat([controls(fitted), products], -1))
         self._planted = controls(held)
         self._here = self._sides(held, self._planted)
         self._trust = trust_in(self._here.said, self._here.true)
@@ -192,20 +191,16 @@ class _Half:
         said, others = self._predict(data)
         planted, products = others.tensor_split([functions.shape[-1]], -1)
         mean = torch.cat([self._mean, torch.ones_like(self._mean), products.new_zeros(products.shape[-1])])
-        true = torch.cat([self._targets(data), self._products(data)], -1)
-        return Sides(torch.cat([said, products], -1) - mean, true - mean, planted, functions)
+        return Sides(torch.cat([said, products], -1) - mean, self._true(data) - mean, planted, functions)
 
-    def _targets(self, data: Transitions) -> Tensor:
-        """Return what is predicted of each agent, and its square in standard deviations from the mean."""
-        return torch.cat([outputs_of(data), self._centred(data).square()], -1)
+    def _true(self, data: Transitions) -> Tensor:
+        """Return what follows for each agent, its squares, and products of neighbours in a field of what is seen.
 
-    def _products(self, data: Transitions) -> Tensor:
-        """Return products of what is seen next with the next number of its field, in standard deviations."""
-        centred = self._centred(data)
-        return centred[..., : len(self._next)] * centred[..., self._next]
-
-    def _centred(self, data: Transitions) -> Tensor:
-        return (outputs_of(data) - self._mean) / self._deviation.clamp_min(STILL)
+        Squares and products are of standard deviations from the mean.
+        """
+        outputs = outputs_of(data)
+        centred = (outputs - self._mean) / self._deviation.clamp_min(STILL)
+        return torch.cat([outputs, centred.square(), centred[..., : len(self._next)] * centred[..., self._next]], -1)
 
 
 class _Compared(NamedTuple):

@@ -71,7 +71,7 @@ def run_or_forecast(kind: str, request: Request, choices: StudyChoices) -> None:
     note_without_effect(without_effect(kind, request))
     if choices.dry_run:
         StudyFolder.planned(out, study)  # refuses the folders that the run would refuse
-        forecast(StudyFolder(out, study), choices, None, {}, "")
+        forecast(StudyFolder(out, study), choices)
     else:
         _run(out, study, choices)
 
@@ -115,12 +115,16 @@ def conclude(
 
 
 def forecast(
-    folder: StudyFolder, choices: StudyChoices, trials: RunSet | None, groups: Mapping[str, Sequence[Cell]], what: str
+    folder: StudyFolder,
+    choices: StudyChoices,
+    trials: RunSet | None = None,
+    groups: Mapping[str, Sequence[Cell]] | None = None,
+    what: str = "",
 ) -> None:
     """Say what is left of a study, or of trials in groups and of the study that judges them, by `what` for short."""
     from esp_cli.studies.forecast import forecast_study, forecast_tuned
 
-    cells = folder.study.cells
+    cells, groups = folder.study.cells, groups or {}
     with (
         open_resources(choices, folder.path, cells[0].config.device) as resources,
         console.TrainingProgress(len(cells) + len(groups), description="measure", unit="runs") as progress,
