@@ -175,7 +175,7 @@ def last_line(error: BaseException) -> str:
 
 
 def install(extra: str) -> str:
-    """Return the command that installs what an extra needs, from any index: "pip install 'optuna>=4.2'"."""
+    """Return the command that installs what an extra needs, from any index: "pip install 'ray>=2.60'"."""
     from importlib.metadata import requires  # noqa: PLC0415 - as above
 
     rows = (row.replace('"', "'").split(";") for row in requires("esp-marl") or [])

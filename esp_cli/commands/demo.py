@@ -18,8 +18,9 @@ from esp_cli.commands.study_progress import StudyProgress
 from esp_cli.files.formatting import format_count
 
 if TYPE_CHECKING:
+    from esp_cli.studies.plan import Study
     from esp_cli.studies.scheduler import Scheduler
-    from esp_cli.studies.study import Study, StudyFolder
+    from esp_cli.studies.study import StudyFolder
 
 EPILOG = """Examples:\n
     esp demo\n
@@ -87,12 +88,8 @@ class LiveCurves(StudyProgress):
         self._folder, self._told = folder, 0
 
     def update(self, scheduler: Scheduler) -> None:
-        from esp_cli.studies.tuning import curve_of
-        from esp_cli.training.folder_names import METRICS
-
         super().update(scheduler)
-        evaluations = {c.variant: curve_of(self._folder.run_path(c) / METRICS) for c in self._folder.study.cells}
-        curves = {name: [(one.step, one.mean) for one in points] for name, points in evaluations.items()}
+        curves = {cell.variant: _curve(self._folder.run_path(cell)) for cell in self._folder.study.cells}
         if self._live is not None:
             self._live.above = draw_curves(curves, self._folder.study.cells[0].config.steps, console.err.width)
             return
@@ -101,6 +98,19 @@ class LiveCurves(StudyProgress):
             returns = (f"{label} {value:.1f}" for label, (_, value) in zip(curves, points, strict=True))
             console.note(f"after {console.format_count(points[0][0])} steps: return {', '.join(returns)}")
         self._told = len(both)
+
+
+def _curve(run: Path) -> list[tuple[int, float]]:
+    """Return the steps of a run's evaluations, and the mean of their greedy returns over the seeds."""
+    from esp_cli.training.folder_names import METRICS
+    from esp_cli.training.metrics import NoMetricError, column, read_metrics
+
+    path = run / METRICS
+    try:
+        steps, returns = column(read_metrics(path) if path.exists() else [], "eval/return_greedy")
+    except NoMetricError:  # before the first
+        return []
+    return list(zip(steps.tolist(), returns.mean(1).tolist(), strict=True))
 
 
 def _show(folder: StudyFolder) -> None:

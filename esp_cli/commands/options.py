@@ -145,8 +145,8 @@ def not_over_a_run(context: typer.Context, path: T) -> T:
     if real.is_dir():  # known before hours of work
         raise UserError(f"{path} is a folder; name a file in it")
     refuse_unwritable(str(path))
-    documents = (of.CONFIG, of.STUDY, of.TUNING)
-    names = (*documents, of.METRICS, of.POLICY, of.INITIAL, of.LOCK, of.JOURNAL, of.STUDY_LOCK)
+    documents = (of.CONFIG, of.STUDY)
+    names = (*documents, of.METRICS, of.POLICY, of.INITIAL, of.LOCK, of.STUDY_LOCK)
     owned = real.is_file() and real.name in (names if context.info_name == "eval" else (*names, of.FINAL))
     home = next((folder.parent for folder in real.parents if folder.name == of.CHECKPOINTS), None)
     for folder in (real.parent if owned else None, home):

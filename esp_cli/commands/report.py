@@ -14,7 +14,7 @@ from esp_cli import console
 from esp_cli.commands import options
 from esp_cli.commands.counts import parse_count
 from esp_cli.defaults import Mode
-from esp_cli.training.folder_names import FRESH, TUNING
+from esp_cli.training.folder_names import FRESH
 from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
@@ -125,13 +125,11 @@ def _side_by_side(
 
 
 def _refuse_trials(path: Path) -> None:
-    """Refuse the folder of a benchmark's trials or a tuning, whose report has a file of this name too."""
+    """Refuse the folder of a search's trials, of which what judges them has the report."""
     from esp_cli.studies.kinds import TRIALS
     from esp_cli.studies.study import StudyFolder
-    from esp_cli.studies.tuning import TUNING_FORMAT
 
-    of_benchmark = StudyFolder.is_one(path) and StudyFolder.open(path).study.kind == TRIALS
-    if of_benchmark or TUNING_FORMAT.is_one(path / TUNING):
+    if StudyFolder.is_one(path) and StudyFolder.open(path).study.kind == TRIALS:
         raise UserError(f"{path} holds trials; report what judges them by: esp report {shlex.quote(str(path / FRESH))}")
 
 

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from typer import Argument, Option
 
 from esp_cli.commands import studying
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
-from esp_cli.console.progress import stop_requests
-from esp_cli.training.folder_names import FRESH
 from esp_envs.errors import UserError
-
-if TYPE_CHECKING:
-    from esp_cli.studies.symmetry import Benchmark
 
 EPILOG = """Examples:\n
     esp reproduce table1 --dry-run\n
@@ -48,41 +43,8 @@ def reproduce(
         from esp_cli.studies.symmetry import METHODS, Benchmark
 
         request = replace(choices.request(), variants=parse_names(methods, METHODS))
-        (_forecast if choices.dry_run else _judge)(Benchmark(request, budget or 5), choices)
+        studying.search_or_forecast(Benchmark(request, budget or 5), "symmetry", choices)
         return
     if methods or budget:
         raise UserError("--methods and --budget are for esp reproduce symmetry; leave them out")
     studying.run_or_forecast(table, choices.request(), choices)
-
-
-def _forecast(benchmark: Benchmark, choices: StudyChoices) -> None:
-    from esp_cli.studies.study import StudyFolder
-    from esp_cli.studies.symmetry import Trials
-
-    out = choices.folder("symmetry")
-    trials, _ = Trials.planned(out, benchmark.trials)
-    study = benchmark.judged(trials, write=False)
-    StudyFolder.planned(out / FRESH, study)
-    groups = {": ".join(pair): own for pair, own in benchmark.trials_of.items()}
-    what = f"{benchmark.budget} trials of each, and the run that judges it"
-    studying.forecast(StudyFolder(out / FRESH, study), choices, trials, groups, what)
-
-
-def _judge(benchmark: Benchmark, choices: StudyChoices) -> None:
-    from esp_cli.studies.study import StudyFolder
-    from esp_cli.studies.symmetry import Trials
-
-    out = choices.folder("symmetry")
-    planned, fresh = benchmark.trials, None
-    with (
-        studying.open_resources(choices, out, benchmark.request.device) as resources,
-        Trials.held(out),
-        stop_requests("stopping every run after its iteration") as requests,
-    ):
-        trials = Trials.create(out, planned)
-        failed = studying.follow(trials, trials.cells_of(planned), resources, requests)
-        if not (requests or failed):
-            study = benchmark.judged(trials)
-            fresh = StudyFolder.create(out / FRESH, study)
-            failed = studying.run_cells(fresh, study, resources, requests)
-    studying.conclude(fresh, failed, requests, out, choices)

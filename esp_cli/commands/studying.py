@@ -17,16 +17,17 @@ from esp_cli.commands.options import note_without_effect
 from esp_cli.commands.study_options import StudyChoices
 from esp_cli.commands.study_progress import StudyProgress
 from esp_cli.console.progress import stop_requests
-from esp_cli.training.folder_names import LOG
+from esp_cli.training.folder_names import FRESH, LOG
 from esp_envs.errors import UserError
 from esp_envs.installed import install
 
 if TYPE_CHECKING:
     from esp_cli.studies.catalogue import Request
     from esp_cli.studies.engine import Engine
-    from esp_cli.studies.run_set import Cell, RunSet
+    from esp_cli.studies.plan import Cell, Study
     from esp_cli.studies.scheduler import Scheduler
-    from esp_cli.studies.study import Study, StudyFolder
+    from esp_cli.studies.search import Search
+    from esp_cli.studies.study import StudyFolder
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,34 @@ def _run(out: Path, study: Study, choices: StudyChoices) -> None:
     conclude(folder, failed, requests, out, choices)
 
 
+def search_or_forecast(search: Search, kind: str, choices: StudyChoices) -> None:
+    """Run the trials of a search and what judges them, or say what that costs, where only that was asked for."""
+    from esp_cli.studies.search import Trials
+    from esp_cli.studies.study import StudyFolder
+
+    out, planned, fresh = choices.folder(kind), search.trials, None
+    if choices.dry_run:
+        trials, _ = Trials.planned(out, planned)
+        study = search.forecast(trials)
+        StudyFolder.planned(out / FRESH, study, search.keeps)
+        groups = {": ".join(one): own for one, own in search.trials_of.items()}
+        what = f"{len(search.draws)} trials of each, and the runs that judge"
+        forecast(StudyFolder(out / FRESH, study), choices, trials, groups, what)
+        return
+    with (
+        open_resources(choices, out, search.request.device) as resources,
+        Trials.held(out),
+        stop_requests("stopping every run after its iteration") as requests,
+    ):
+        trials = Trials.create(out, planned)
+        failed = follow(trials, trials.cells_of(planned), resources, requests)
+        if not (requests or failed):
+            study = search.judged(trials)
+            fresh = StudyFolder.create(out / FRESH, study, search.keeps)
+            failed = run_cells(fresh, study, resources, requests)
+    conclude(fresh, failed, requests, out, choices)
+
+
 def conclude(
     study: StudyFolder | None, failed: Sequence[str], requests: Sequence[int], out: Path, choices: StudyChoices
 ) -> None:
@@ -117,7 +146,7 @@ def conclude(
 def forecast(
     folder: StudyFolder,
     choices: StudyChoices,
-    trials: RunSet | None = None,
+    trials: StudyFolder | None = None,
     groups: Mapping[str, Sequence[Cell]] | None = None,
     what: str = "",
 ) -> None:
@@ -171,20 +200,20 @@ def run_cells(
 
 
 def follow(
-    folder: RunSet,
+    folder: StudyFolder,
     cells: Sequence[Cell],
     resources: Resources,
     requests: Sequence[int],
     progress: StudyProgress | None = None,
 ) -> list[str]:
-    """Run cells of a study or search with live progress, by default a bar for each; return the names of the failed."""
+    """Run cells of a study with live progress, by default a bar for each; return the names of the failed."""
     from esp_cli.studies.scheduler import Scheduler
 
     folder.check = resources.check
     scheduler = Scheduler(folder, cells, min(resources.jobs, len(cells)), resources.engine)
     console.note(
-        f"{folder.title}: {len(cells)} runs, {scheduler.count('finished')} of them finished, {scheduler.jobs} side by "
-        f"side -> {folder.path}"
+        f"{folder.study.title}: {len(cells)} runs, {scheduler.count('finished')} of them finished, "
+        f"{scheduler.jobs} side by side -> {folder.path}"
     )
     with progress or StudyProgress() as shown:
 

@@ -31,9 +31,8 @@ _GONE: dict[str, dict[str, object]] = {
     "predator-prey": {"prey_policy": None, "prey_policy_seed": 0, "learned_prey": 0.0, **_FORCES},
     "formation": {"penalty_counts": "any", "lame_wheel": 0.0, "heading_offset_rad": 0.0, "blind_sector_rad": 0.0},
     "prior": {"stop_gradient": "none", "terms": "both"},
-    "esp-tuning": {"goal": "return", "reach": None},
 }
-"""Settings that earlier versions wrote into files, with their defaults: of a task, the prior, or a document."""
+"""Settings that earlier versions wrote into files, with their defaults: of a task, or the prior."""
 _TOO_DEEP = f"it is nested more than {MAX_NESTING} deep"
 
 
@@ -81,7 +80,7 @@ class DocumentFormat:
         """Read a document and validate its content; errors as of `read`."""
         content = self.read(path)
         try:
-            return validate(model, without_gone(self.name, content))
+            return validate(model, content)
         except ValidationError as error:
             raise self.error(f"{path} is damaged: {one_sentence(error, model)}") from None
         except UserError as error:

@@ -1,1 +1,1 @@
-"""Reports of studies, runs and tunings: results, tables, figures and pages."""
+"""Reports of studies and runs: results, tables, figures and pages."""

@@ -20,8 +20,8 @@ from esp_cli.policies.statistics import area_under_curve, steps_to_threshold, su
 from esp_cli.reporting.results import CellResult, Results, returns_of, summarised
 from esp_cli.studies.kinds import kind_of
 from esp_cli.studies.paper import reported
-from esp_cli.studies.run_set import Cell
-from esp_cli.studies.study import Study, StudyFolder, read_evaluation
+from esp_cli.studies.plan import Cell, Study
+from esp_cli.studies.study import StudyFolder, read_evaluation
 from esp_cli.training.build import spec_of
 from esp_cli.training.config import RunConfig
 from esp_cli.training.folder_names import METRICS

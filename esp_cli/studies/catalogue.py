@@ -12,8 +12,7 @@ from esp_cli.defaults import EPISODES, STUDY_SEEDS
 from esp_cli.files.formatting import file_name, format_exactly
 from esp_cli.studies import paper
 from esp_cli.studies.kinds import GROUP, KINDS, UNBROKEN, Settings, StudyKind, Team
-from esp_cli.studies.run_set import Cell
-from esp_cli.studies.study import Study
+from esp_cli.studies.plan import Cell, Study
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config, resolve_task_settings
 from esp_envs.errors import UserError

@@ -1,4 +1,4 @@
-"""What a study or a search still costs on this machine: seconds by a short probe of each run."""
+"""What a study, or a search, still costs on this machine: seconds by a short probe of each run."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from esp_cli.files.formatting import format_count
-from esp_cli.studies.run_set import Cell, RunSet
+from esp_cli.studies.plan import Cell
 from esp_cli.studies.scheduler import makespan
 from esp_cli.studies.study import StudyFolder
 from esp_cli.training.build import PolicyController, build_environment, build_learner, generators, play
@@ -81,11 +81,11 @@ def forecast_study(
 
 
 def forecast_tuned(
-    folder: RunSet, groups: Mapping[str, Sequence[Cell]], judged: Forecast, listener: Callable[[int], object]
+    folder: StudyFolder, groups: Mapping[str, Sequence[Cell]], judged: Forecast, listener: Callable[[int], object]
 ) -> Forecast:
     """Measure what is left of trials, in groups with names, and add what is `judged` once they have ended.
 
-    All trials of a group are taken to cost what its first one does, and none to be pruned.
+    All trials of a group are taken to cost what its first one does.
     """
     known, runs, left_s = dict[str, Cost](), list[RunForecast](), list[float]()
     for name, cells in groups.items():
@@ -97,7 +97,7 @@ def forecast_tuned(
         left_s += own
         listener(len(runs))
     seconds, core_seconds = makespan([], left_s, judged.jobs) + judged.seconds, sum(left_s) + judged.core_seconds
-    return Forecast(folder.title, folder.path, judged.jobs, seconds, core_seconds, (*runs, *judged.runs))
+    return Forecast(folder.study.title, folder.path, judged.jobs, seconds, core_seconds, (*runs, *judged.runs))
 
 
 def _cost(config: RunConfig, episodes: int, known: dict[str, Cost]) -> Cost:

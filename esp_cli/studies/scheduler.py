@@ -1,4 +1,4 @@
-"""The one scheduler of studies and searches: runs side by side in processes of their own, resumed and skipped."""
+"""The scheduler of studies: runs side by side in processes of their own, resumed and skipped."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Literal
 
 from esp_cli.files.formatting import sentence
 from esp_cli.studies.engine import Engine, Job
-from esp_cli.studies.run_set import Cell, RefusedError, RunSet
+from esp_cli.studies.plan import Cell
+from esp_cli.studies.study import StudyFolder
 from esp_envs.errors import UserError
 
 Status = Literal["waiting", "training", "evaluating", "elsewhere", "finished", "failed", "stopped"]
@@ -20,12 +21,12 @@ POLL_S = 0.5  # seconds between two looks at the running processes
 class Run:
     """Where one cell stands."""
 
-    cell: Cell  # of the study or search
+    cell: Cell  # of the study
     # "elsewhere" is in use by a process that an earlier, killed scheduler left; it is waited for
     status: Status = "waiting"
     step: int = 0  # environment steps per seed so far
     trained_s: float = 0.0  # seconds of training behind these steps, summed over interruptions
-    message: str = ""  # why it failed, or why there was nothing to run
+    message: str = ""  # why it failed
     job: Job | None = field(default=None, repr=False)  # its process, if this scheduler started it
     asked: bool = field(default=False, repr=False)  # whether the process was asked to stop
 
@@ -47,9 +48,9 @@ class Run:
 
 
 class Scheduler:
-    """Runs the cells of a study or search side by side; the set of runs says what each of them does next."""
+    """Runs cells of a study side by side; its folder says what each of them does next."""
 
-    def __init__(self, folder: RunSet, cells: Sequence[Cell], jobs: int, engine: Engine) -> None:
+    def __init__(self, folder: StudyFolder, cells: Sequence[Cell], jobs: int, engine: Engine) -> None:
         self.folder, self.jobs, self.engine = folder, jobs, engine
         self.runs = [Run(cell, "finished" if folder.is_finished(cell) else "waiting") for cell in cells]
 
@@ -65,8 +66,6 @@ class Scheduler:
         going = True
         for run in self.runs:
             run.step, run.trained_s = self.folder.progress(run.cell)
-            if run.status == "finished":  # a kill may have left something behind
-                self.folder.end(run.cell)
         try:
             while True:
                 if going:
@@ -113,36 +112,21 @@ class Scheduler:
 
     def _start(self, run: Run) -> None:
         try:
-            run.cell = self.folder.begin(run.cell)
-            if self._is_over(run):
-                return
-            if self.folder.is_in_use(run.cell):
-                run.status = "elsewhere"
+            self.folder.prepare(run.cell)
+            if self.folder.is_finished(run.cell) or self.folder.is_in_use(run.cell):
+                run.status = "finished" if self.folder.is_finished(run.cell) else "elsewhere"
                 return
             arguments = self.folder.next_command(run.cell)
             run.status = "training" if arguments[0] == "train" else "evaluating"
             run.job, run.asked = self.engine.start(arguments, self.folder.log_path(run.cell)), False
-        except RefusedError as reason:
-            run.status, run.message = "finished", str(reason)
         except OSError as error:
             run.status, run.message = "failed", sentence(error)
         except UserError as error:
             run.status, run.message = "failed", str(error)
 
-    def _is_over(self, run: Run) -> bool:
-        """Return whether nothing is left to do for a run, and then say so and tidy up."""
-        if self.folder.goes_on(run.cell):
-            return False
-        run.status = "finished"
-        self.folder.end(run.cell)
-        return True
-
     def _follow(self, run: Run, going: bool) -> None:
-        """Look at a run: how far it is, whether it is to go on, and whether its process has ended."""
-        before = run.step
+        """Look at a run: how far it is, and whether its process has ended."""
         run.step, run.trained_s = self.folder.progress(run.cell)
-        if run.step != before and not run.asked and not self.folder.goes_on(run.cell):
-            run.ask_to_stop()
         if run.job is None:  # in use by a process that is not ours
             if not self.folder.is_in_use(run.cell):
                 run.status = "waiting" if going else "stopped"
@@ -151,9 +135,9 @@ class Scheduler:
 
     def _ended(self, run: Run, code: int, words: str, going: bool) -> None:
         run.job, trained = None, run.status == "training" and self.folder.is_trained(run.cell)
-        if self._is_over(run):
-            return
-        if going and code == 0 and trained:
+        if self.folder.is_finished(run.cell):
+            run.status = "finished"
+        elif going and code == 0 and trained:
             self._start(run)
         else:
             run.status, run.message = ("failed", words) if going else ("stopped", "")

@@ -13,42 +13,29 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Literal, Self
+from typing import Self
 
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 
-from esp_cli.defaults import __version__
-from esp_cli.files.documents import MAX_DOCUMENT_BYTES, DocumentError, DocumentFormat, Strict, parse_object, validate
+from esp_cli.files.documents import MAX_DOCUMENT_BYTES, DocumentError, parse_object, validate
 from esp_cli.files.formatting import shortened
-from esp_cli.files.opening import open_own, read_regular
+from esp_cli.files.opening import holding, is_held, open_own, read_regular
+from esp_cli.files.writing import TEMPORARY_PREFIX
 from esp_cli.policies.evaluation import FinalEvaluation
-from esp_cli.studies.run_set import FOLDER_NAME, Cell, RunSet
+from esp_cli.studies.plan import STUDY_FORMAT, Cell, Study
 from esp_cli.training.config import RunConfig, completed
-from esp_cli.training.folder_names import FINAL, LOG, STUDY
+from esp_cli.training.folder_names import CONFIG, FINAL, FRESH, LOCK, LOG, METRICS, POLICY, RUNS, STUDY, STUDY_LOCK
+from esp_cli.training.metrics import elapsed_s, read_last_row
+from esp_cli.training.run_folder import RunFolder
+from esp_cli.training.settings import parse_config
 from esp_envs.errors import UserError
 from esp_envs.registry import make
 
-STUDY_FORMAT = DocumentFormat("esp-study", 1, "a study")
-
-
-class Study(Strict):
-    """A named list of runs."""
-
-    kind: str  # what it reproduces, such as "table1" or "ablate-transforms"; "runs" for runs put together by hand
-    title: str  # one line for people
-    command: str  # the command that plans it again; one a line where several added to it
-    episodes: int = Field(ge=1)  # per seed, of the final evaluation of a trained policy
-    esp_version: str = __version__  # of the program that planned it
-    rows: Literal["panels", "variants"] = Field(description="what the rows of the table are; the other are columns")
-    cells: tuple[Cell, ...]  # in the order in which they are run and shown
-    left_out: dict[str, str] = Field({})  # by "TASK: METHOD" why there is no such cell
-
-    @property
-    def panels(self) -> list[str]:
-        return list(dict.fromkeys(cell.panel for cell in self.cells))
+FOLDER_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")  # so that nothing is written outside of the study
 
 
 def _completed(cell: Cell) -> Cell:
@@ -58,23 +45,56 @@ def _completed(cell: Cell) -> Cell:
     return cell
 
 
-class StudyFolder(RunSet):
-    """A folder that holds a study, all that was ever planned in it.
+class StudyFolder:
+    """A folder that holds a study, all that was ever planned in it, and that one process at a time works on.
+
+    What is done and what is not is read off the folder alone, so a process may be killed at any moment, and the next
+    one goes on with what is there.
 
     Example:
         >>> folder = StudyFolder.open(Path("runs/table1"))  # doctest: +SKIP
         >>> [cell.name for cell in folder.study.cells if not folder.is_finished(cell)]  # doctest: +SKIP
     """
 
-    document, runs, noun = STUDY, "runs", "study"
-
     def __init__(self, path: Path, study: Study) -> None:
         names = [cell.name for cell in study.cells]
         for name in names:
             if not FOLDER_NAME.fullmatch(name) or names.count(name) > 1:
                 raise UserError(f"{path / STUDY} is damaged: {shortened(repr(name))} is not the name of one run")
-        super().__init__(path, study.title)
-        self.study = study
+        self.path, self.study = path, study
+        self.check = True  # whether runs take a short look at a task that is not built in
+
+    @classmethod
+    def is_one(cls, path: Path) -> bool:
+        return (path / STUDY).is_file()
+
+    @classmethod
+    def refuse_foreign(cls, path: Path) -> None:
+        """Refuse a folder that is neither new nor empty nor a study, or that has a link where its runs belong."""
+        if path.is_file():
+            raise UserError(f"{path} is a file; choose another --out")
+        if (path / RUNS).is_symlink():
+            raise UserError(f"{path / RUNS} is a link, which is not followed; put the folder itself there")
+        if not cls.is_one(path) and path.is_dir():
+            names = (entry.name for entry in path.iterdir())
+            foreign = [name for name in names if name != STUDY_LOCK and not name.startswith(TEMPORARY_PREFIX)]
+            if foreign:
+                raise UserError(f"{path} is not empty and no study (it has {foreign[0]!r}); choose another --out")
+
+    @classmethod
+    @contextlib.contextmanager
+    def held(cls, path: Path) -> Iterator[None]:
+        """Hold the folder, made if missing, so that no second process plans or works in it.
+
+        Half-written documents that a killed process left are removed, those of the study that judges a search too.
+        """
+        cls.refuse_foreign(path)
+        path.mkdir(parents=True, exist_ok=True)
+        with holding(path / STUDY_LOCK):
+            for folder in (path, path / FRESH):
+                for file in folder.glob(f"{TEMPORARY_PREFIX}*"):
+                    file.unlink(missing_ok=True)
+            yield
 
     @classmethod
     def create(cls, path: Path, study: Study, keep: bool = True) -> Self:
@@ -144,6 +164,36 @@ class StudyFolder(RunSet):
                 f"version {version}; choose another --out"
             )
 
+    def run_path(self, cell: Cell) -> Path:
+        return self.path / RUNS / cell.name
+
+    def log_path(self, cell: Cell) -> Path:
+        """Return the file that the processes of a cell write to."""
+        return self.run_path(cell) / LOG
+
+    def prepare(self, cell: Cell) -> RunFolder:
+        """Make the run folder of a cell, or open the one that is there, unless that is damaged or another run."""
+        path = self.run_path(cell)
+        if not (path / CONFIG).exists():
+            return RunFolder.create(path, cell.config.model_dump(mode="json"))
+        folder = RunFolder.open(path)
+        if parse_config(folder.config, path) != cell.config:
+            raise UserError(f"{path} holds a run of another configuration; move it away, or choose another --out")
+        return folder
+
+    def progress(self, cell: Cell) -> tuple[int, float]:
+        """Return how many steps per seed a run has done in how many seconds, which it may redo from a checkpoint."""
+        row = read_last_row(self.run_path(cell) / METRICS)
+        return min(int(row.get("step", 0)), cell.config.steps), elapsed_s(row)
+
+    def is_in_use(self, cell: Cell) -> bool:
+        """Return whether a process works on a cell, such as one that a killed scheduler left."""
+        return is_held(self.run_path(cell) / LOCK)
+
+    def is_trained(self, cell: Cell) -> bool:
+        """Return whether a cell's training is done; the policy file is the last that a run writes."""
+        return (self.run_path(cell) / POLICY).is_file()
+
     def evaluation_path(self, cell: Cell) -> Path:
         """Return the file that the final evaluation of a cell's trained policy is written to."""
         return self.run_path(cell) / FINAL
@@ -151,20 +201,11 @@ class StudyFolder(RunSet):
     def is_finished(self, cell: Cell) -> bool:
         return self.is_trained(cell) and read_evaluation(self.run_path(cell)) is not None
 
-    def begin(self, cell: Cell) -> Cell:
-        self.prepare(cell)
-        return cell
-
-    def goes_on(self, cell: Cell) -> bool:
-        return not self.is_finished(cell)
-
-    def end(self, cell: Cell) -> None:
-        """Leave a finished cell as it is: training has removed what nothing goes on from."""
-
     def next_command(self, cell: Cell) -> list[str]:
         """Return the arguments that train a cell, or that evaluate it once it is trained."""
         if not self.is_trained(cell):
-            return super().next_command(cell)
+            unseen = [] if self.check else ["--no-check"]
+            return ["train", "--resume", str(self.run_path(cell)), *unseen, *cell.config.own_words()]
         final = self.evaluation_path(cell)
         final.unlink(missing_ok=True)  # a damaged one is made again, and a link there is not followed
         words = ["eval", str(self.run_path(cell)), "--episodes", str(self.study.episodes), "--json", str(final)]
@@ -209,7 +250,7 @@ class StudyFolder(RunSet):
 
     def adopt(self, cell: Cell, twin: Path) -> None:
         """Take a finished run over as this cell's, without links, which bring in files from anywhere; its log tells."""
-        part = self.path / self.runs / f".{cell.name}.part"
+        part = self.path / RUNS / f".{cell.name}.part"
         shutil.rmtree(part, ignore_errors=True)  # what a kill left
         shutil.copytree(twin, part, ignore=lambda folder, names: [n for n in names if Path(folder, n).is_symlink()])
         with os.fdopen(open_own(part / LOG, os.O_WRONLY | os.O_APPEND), "a", encoding="utf-8") as log:

@@ -5,29 +5,20 @@ One learner at a time, MAPPO unless another is asked for.
 
 from __future__ import annotations
 
-import json
-import math
 import random
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from pathlib import Path
-from typing import Self
-
-import numpy as np
 
 from esp_cli.checking.measured import planned
 from esp_cli.files.formatting import file_name, format_exactly
-from esp_cli.files.writing import replace_file
 from esp_cli.prior.config import of_no_use_to
 from esp_cli.studies.catalogue import Request, refuse_other_tasks, refuse_unknown_or_twice, refuse_varied, settings_of
-from esp_cli.studies.kinds import KINDS, TRIALS, Settings
-from esp_cli.studies.run_set import Cell
-from esp_cli.studies.study import Study, StudyFolder
+from esp_cli.studies.kinds import KINDS, Settings
+from esp_cli.studies.plan import Cell
+from esp_cli.studies.search import FIRST_TRIAL_SEED, Candidate, Search
+from esp_cli.studies.space import LEARNERS, Dimension, drawn, of_learner
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config
-from esp_cli.training.folder_names import FRESH, METRICS
-from esp_cli.training.metrics import column, read_last_row, read_metrics
 from esp_envs.errors import UserError
 from esp_envs.registry import TASKS as TASK_CLASSES
 
@@ -96,114 +87,54 @@ TASKS: Mapping[str, Board] = {
 }
 """By the name that the tables have; other tasks stand for themselves."""
 
-Space = Mapping[str, tuple[object, ...]]
-_OFF_POLICY: Space = {
-    "learning_rate": (1e-3, 2e-3, 4e-3, 1e-2),
-    "gamma": (0.9, 0.95, 0.98, 0.99),
-    "td_lambda": (0.3, 0.6, 0.8, 0.9),
-    "updates_per_episode": (1, 2),
-    "num_envs": (4, 8),
-    "epsilon_steps": (5_000, 10_000, 20_000, 50_000),
-}
-SPACES: Mapping[str, Space] = {
-    "mappo": {
-        "learning_rate": (1e-3, 2e-3, 4e-3, 8e-3),
-        "entropy_coef": (0.001, 0.003, 0.01, 0.03),
-        "gamma": (0.9, 0.95, 0.98, 0.99),
-        "gae_lambda": (0.8, 0.9, 0.95),
-        "num_epochs": (3, 5, 8),
-        "num_minibatches": (2, 5, 10),
-        "num_envs": (64, 128),
-    },
-    "maddpg": {
-        **_OFF_POLICY,
-        "actor_learning_rate": (1e-3, 2e-3, 4e-3, 1e-2),
-        "tau": (0.005, 0.01, 0.03),
-        "output_penalty": (1e-4, 1e-3, 1e-2),
-    },
-    "qmix": {**_OFF_POLICY, "target_every": (25, 50, 100, 200), "replay_episodes": (500, 1000, 5000)},
-}
-"""What is tried of each learner's settings."""
-_COEFFICIENT: Space = {"prior.consistency_coef": (0.03, 0.1, 0.3, 1.0)}
-_OF_NETWORKS: Space = {"network.relax": (0.1, 0.3, 1.0, 3.0)}
+_OF_NETWORKS = {"network.relax": Dimension(choices=(0.1, 0.3, 1.0, 3.0))}
 _OF_BATCHES = ("gamma", "num_minibatches", "num_envs")
-TRIAL_SEEDS = (100, 101, 102)
-_SCORED = 2  # greedy evaluations at the end of a trial whose mean is its score
-_RETURN = "eval/return_greedy"
 
 
 def draws(algorithm: str, count: int) -> list[dict[str, object]]:
     """Return a learner's settings to try, the same for every method and task: the preset's own, then drawn ones."""
     found: list[dict[str, object]] = [{} for _ in range(count)]
-    own = {f"{algorithm}.{name}": values for name, values in SPACES[algorithm].items()}
-    for seed, space in enumerate(({**own, **_COEFFICIENT}, _OF_NETWORKS)):
+    for seed, space in enumerate((of_learner(algorithm), _OF_NETWORKS)):
         generator = random.Random(seed)
         for one in found[1:]:
-            one.update((name, generator.choice(values)) for name, values in space.items())
+            one.update(drawn(space, generator))
     return found
 
 
-def score(run: Path) -> float:
-    """Return the mean of a trial's last two greedy evaluations over its seeds, -inf where one is not finite."""
-    _, returns = column(read_metrics(run / METRICS), _RETURN)
-    return float(np.nan_to_num(returns[-_SCORED:], nan=-np.inf).mean())
-
-
-class Trials(StudyFolder):
-    """The trials of a benchmark: runs without a final evaluation, in whose folder `fresh` is the study that judges."""
-
-    def is_finished(self, cell: Cell) -> bool:
-        """Return whether a trial is trained, or has ended without a policy since every seed stopped."""
-        last = read_last_row(self.run_path(cell) / METRICS).get(_RETURN)
-        return self.is_trained(cell) or (isinstance(last, list) and all(value is None for value in last))
-
-    @classmethod
-    def planned(cls, path: Path, study: Study, keep: bool = True) -> tuple[Self, bool]:
-        """Return what `create` makes of the folder; what is judged already gets no further trials."""
-        if StudyFolder.is_one(path / FRESH) and cls.is_one(path):
-            known = {cell.name for cell in cls.open(path).study.cells}
-            done = {cell.name for cell in StudyFolder.open(path / FRESH).study.cells}
-            for cell in study.cells:
-                if cell.name not in known and (judged := cell.name.rpartition("-")[0]) in done:
-                    raise UserError(
-                        f"{path / FRESH} has judged {judged} already; keep its --budget, or choose another --out"
-                    )
-        return super().planned(path, study, keep)
-
-
-class Benchmark:
-    """What is asked for: the methods that each task takes, and by "TASK: METHOD" why others are left out."""
+class Benchmark(Search):
+    """The methods that each task takes."""
 
     title = "Trials of the benchmark of symmetry"
+    judges = "symmetry", "Symmetry in multi-agent learning, each method tuned on equal steps"
 
     def __init__(self, request: Request, budget: int) -> None:
-        self.request, self.budget = request, budget
+        self.request, self.trial_seeds = request, tuple(range(FIRST_TRIAL_SEED, FIRST_TRIAL_SEED + 3))
         self.methods = tuple(METHODS if request.variants is None else request.variants)
         self.boards = {name: TASKS.get(name) or Board(name) for name in request.tasks or TASKS}
         self.algorithm = (request.algorithms or ("mappo",))[0]
         self._refuse_wrong()
+        self.draws = draws(self.algorithm, budget)
         self.left_out: dict[str, str] = {}
         for board in self.boards.values():
             if ":" in board.task:
                 TASK_CLASSES.register(board.task)
-        self.taken = tuple(self._taken())
-        lost = [name for name in self.boards if not any(name == task for task, _ in self.taken)]
-        if lost and (request.tasks or not self.taken):  # a task that the user named, and that no method can be run on
+        self.candidates = tuple(self._taken())
+        lost = [name for name in self.boards if not any(name == task for task, _ in self.candidates)]
+        if lost and (request.tasks or not self.candidates):  # a task that the user named, and that no method takes
             raise UserError(self.left_out[f"{lost[0]}: {self.methods[0]}"])
 
     def _refuse_wrong(self) -> None:
         refuse_unknown_or_twice("method", self.methods, METHODS)
-        if len(self.request.algorithms or ()) > 1 or self.algorithm not in SPACES:
-            raise UserError(f"this benchmark tunes one learner, whose space it has; --algo {', '.join(SPACES)}")
-        if shared := set(self.request.seeds) & set(TRIAL_SEEDS):
-            raise UserError(f"seed {min(shared)} belongs to the trials; choose seeds that no trial has")
+        if len(self.request.algorithms or ()) > 1 or self.algorithm not in LEARNERS:
+            raise UserError(f"this benchmark tunes one learner, whose space it has; --algo {', '.join(LEARNERS)}")
+        self.refuse_trial_seeds()
         own = {name for method in self.methods for name in METHODS[method]}
         for board in self.boards.values():
             varied = own | {name for name in board.settings if name.startswith("task.")}
             refuse_varied(self.request.overrides, [board.task], varied)
         refuse_other_tasks(self.request.steps or (), self.boards)
 
-    def _taken(self) -> Iterator[tuple[str, str]]:
+    def _taken(self) -> Iterator[Candidate]:
         for name in self.boards:
             for method in self.methods:
                 try:
@@ -234,8 +165,8 @@ class Benchmark:
         idle = {f"prior.{key}" for key in of_no_use_to(str(own["prior.kind"]))}
         idle |= (_OF_NETWORKS.keys() - own.keys()) | given.keys()
         idle |= set() if board.batches else {f"{algorithm}.{key}" for key in _OF_BATCHES}
-        drawn = {key: value for key, value in draws(algorithm, self.budget)[draw].items() if key not in idle}
-        steps, seeds = self.steps(name, trial), TRIAL_SEEDS if trial else request.seeds
+        drawn = {key: value for key, value in self.draws[draw].items() if key not in idle}
+        steps, seeds = self.steps(name, trial), self.trial_seeds if trial else request.seeds
         settings = {**board.settings, **own, **drawn, **given}
         return planned(resolve_config(board.task, algorithm, preset, steps, seeds, request.device, settings))
 
@@ -250,40 +181,14 @@ class Benchmark:
             config=self.config(name, method, draw, trial),
         )
 
-    def _study(self, kind: str, title: str, cells: Iterable[Cell], left_out: Mapping[str, str]) -> Study:
-        same = {"command": self.request.command, "episodes": self.request.episodes, "left_out": dict(left_out)}
-        return Study(kind=kind, title=title, rows="variants", cells=tuple(cells), **same)
+    def trial(self, candidate: Candidate, draw: int) -> Cell:
+        return self._cell(*candidate, draw, trial=True)
 
-    @cached_property
-    def trials_of(self) -> dict[tuple[str, str], list[Cell]]:
-        """By task and method its trials, one for each draw."""
-        return {pair: [self._cell(*pair, draw, trial=True) for draw in range(self.budget)] for pair in self.taken}
-
-    @property
-    def trials(self) -> Study:
-        """The plan of the trials of all methods on all tasks."""
-        return self._study(TRIALS, self.title, sum(self.trials_of.values(), list[Cell]()), self.left_out)
-
-    def judged(self, trials: Trials, write: bool = True) -> Study:
-        """Plan the runs that judge, with each method's best trial, the first of equals; `trials.json` has scores.
-
-        A trial that is not finished counts as 0, for a forecast, which is not to `write`.
-        """
-        cells, left_out, firsts = list[Cell](), dict(self.left_out), dict[str, str]()
-        scores = dict[str, list[float | None]]()
-        for (name, method), tried in self.trials_of.items():
-            own = [score(trials.run_path(cell)) if trials.is_finished(cell) else 0.0 for cell in tried]
-            scores[f"{name}: {method}"] = [value if math.isfinite(value) else None for value in own]
-            if max(own) == -math.inf:
-                left_out[f"{name}: {method}"] = "a seed stopped in each of its trials"
-                continue
-            cell = self._cell(name, method, int(np.argmax(own)), trial=False)
+    def fresh(self, best: Mapping[Candidate, int]) -> list[Cell]:
+        """Return one run for each; those of a task are compared with its first."""
+        cells, firsts = list[Cell](), dict[str, str]()
+        for name, method in filter(best.__contains__, self.candidates):
+            cell = self._cell(name, method, best[name, method], trial=False)
             first = firsts.setdefault(name, cell.name)
             cells.append(cell.model_copy(update={"reference": None if first == cell.name else first}))
-        if write:
-            document = {"draws": draws(self.algorithm, self.budget), "seeds": TRIAL_SEEDS, "scores": scores}
-            replace_file(trials.path / "trials.json", (json.dumps(document, indent=1) + "\n").encode())
-        if not cells:
-            raise UserError(f"a seed stopped in every trial in {trials.path}, so there is nothing to judge")
-        title = "Symmetry in multi-agent learning, each method tuned on equal steps"
-        return self._study("symmetry", title, cells, left_out)
+        return cells

@@ -1,72 +1,81 @@
-"""Tuning: what is asked for, what a trial runs, how its curve is scored, and the study that evaluates the best."""
+"""Tuning: a search of a learner's settings on one task, for each kind of prior, and what it makes of the best."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+import json
+import random
+from collections.abc import Mapping, Sequence
+from itertools import count
 from pathlib import Path
 
-from pydantic import Field, JsonValue
-
+from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.checking.measured import planned
-from esp_cli.files.documents import DocumentFormat, Strict
 from esp_cli.files.formatting import file_name, format_count
-from esp_cli.studies.run_set import Cell
-from esp_cli.studies.study import Study
-from esp_cli.studies.tuning_space import Dimension, space_of
+from esp_cli.files.writing import replace_file
+from esp_cli.studies.catalogue import Request, refuse_other_tasks, refuse_unknown_or_twice, task_setting
+from esp_cli.studies.plan import Cell, Study
+from esp_cli.studies.search import FIRST_TRIAL_SEED, Candidate, Search, Trials
+from esp_cli.studies.space import Space, default_space, drawn, read_space, space_of
+from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config
-from esp_cli.training.metrics import column, read_metrics
 from esp_envs.errors import UserError
 
-SMOOTHED = 3  # evaluations, up to the newest, whose mean is the score of a curve
-RUNGS = 2  # times that successive halving looks at a trial before its end
-REDUCTION = 3  # one of so many trials goes on at each rung, and trains so many times as long
 _GIVEN = ("task", "evaluation")  # varied, a search would take the easiest task, or the best-scoring evaluation
+_TRIES = 20  # of drawing settings that go together and are new, for each trial
 NAMES = {"none": "plain", "esp": "ESP", "auto": "auto", "augment": "augmentation", "consistency": "loss"}
 
 
-class Tuning(Strict):
-    """What is asked for."""
+class Tuning(Search):
+    """Each kind of prior with its trials.
 
-    task: str  # its name
-    algorithm: str  # its name
-    preset: str = "default"  # of every run
-    priors: tuple[str, ...]  # kinds of prior; each has a search of its own with the same budget
-    budget: int = Field(ge=1)  # trials for each prior
-    steps: int = Field(ge=1)  # environment steps per seed of a trial that is not pruned
-    trial_seeds: tuple[int, ...]  # of every trial
-    overrides: dict[str, JsonValue] = Field({})  # settings of all runs, as `--set` takes them
-    space: dict[str, Dimension]  # what is tried
-    device: str = "cpu"  # of every run
-    command: str = ""  # the command line behind it
+    Attributes:
+        refused: why draws were left out, one text each: their settings do not go together.
+    """
 
-    @property
-    def title(self) -> str:
-        return f"Tuning of {self.algorithm.upper()} on {self.task}"
+    title = "Trials of a tuning"
+    keeps = False  # a longer search may find another winner
 
-    def config(self, prior: str, settings: Mapping[str, object], seeds: Sequence[int] | None = None) -> RunConfig:
-        """Resolve the run of a prior with these settings over those of all runs."""
-        config = planned(self._asked(prior, settings, self.trial_seeds if seeds is None else seeds))
+    def __init__(
+        self, request: Request, priors: Sequence[str], budget: int, trial_seeds: int = 3, space: Path | None = None
+    ) -> None:
+        for flag, names in (("--task", request.tasks), ("--algo", request.algorithms), ("--steps", request.steps)):
+            if names is not None and len(names) != 1:
+                raise UserError(f"esp tune takes one {flag}, not {len(names)}; run it once for each")
+        refuse_unknown_or_twice("kind of prior", priors, NAMES)
+        self.request, self.priors = request, tuple(priors)
+        self.task, self.algorithm = (request.tasks or ("navigation",))[0], (request.algorithms or ("mappo",))[0]
+        refuse_other_tasks(request.steps or (), (self.task,))
+        ALGORITHMS[self.algorithm]  # refuses an unknown algorithm before the space that it lacks
+        self.steps = request.steps[0][1] if request.steps else 500_000
+        self.judges = "tuned", f"Tuned settings of {self.algorithm.upper()} on {self.task}, judged on fresh seeds"
+        self.trial_seeds = tuple(range(FIRST_TRIAL_SEED, FIRST_TRIAL_SEED + trial_seeds))
+        self.overrides = {task_setting(name, self.task): value for name, value in request.overrides.items()}
+        self.candidates, self.left_out = tuple((self.task, NAMES[prior]) for prior in priors), {}
+        self.space = self._chosen(space)
+        self._check()
+        self.refused = list[str]()
+        self.draws = self._draws(budget)
+
+    def config(self, prior: str, settings: Mapping[str, object], seeds: Sequence[int]) -> RunConfig:
+        """Resolve the run of a kind of prior with these settings over those of all runs."""
+        config = planned(self._asked(prior, settings, seeds))
         return RunConfig.model_validate_json(config.model_dump_json())  # a tuple becomes a list, as when read again
 
     def _asked(self, prior: str, settings: Mapping[str, object], seeds: Sequence[int]) -> RunConfig:
-        """Return a run before anything is measured for it."""
-        chosen = {**self.overrides, "prior.kind": prior, **settings}
-        return resolve_config(self.task, self.algorithm, self.preset, self.steps, seeds, self.device, chosen)
+        """Return a run before anything is measured for it; without a prior, none of its settings counts."""
+        own = {name: value for name, value in settings.items() if name in space_of(self.space, prior)}
+        chosen = {**self.overrides, "prior.kind": prior, **own}
+        request = self.request
+        return resolve_config(self.task, self.algorithm, request.preset, self.steps, seeds, request.device, chosen)
 
-    def default_values(self, prior: str, names: Iterable[str]) -> dict[str, JsonValue]:
-        """Return what these settings are where nothing is tried; None of one that a run does not have."""
-        config = self.config(prior, {}).model_dump(mode="json")
-        sections = {"task": "task_settings", self.algorithm: "algorithm_settings"}
-        places = {name: name.partition(".")[::2] for name in names}
-        return {name: config[sections.get(section, section)].get(key) for name, (section, key) in places.items()}
-
-    def around_defaults(self) -> Tuning:
-        """Return a search whose space holds the default settings too, which trial 0 then has, and no others."""
-        values = self.default_values(self.priors[0], self.space)
-        own = {name: d.holding(values[name]) for name, d in self.space.items() if values[name] is not None}
-        return self.model_copy(update={"space": own})
+    def _chosen(self, file: Path | None) -> Space:
+        """Return the space of a file, or of the default one what a run has."""
+        if file is not None:
+            return {task_setting(name, self.task): tried for name, tried in read_space(file).items()}
+        self.space = default_space(self.algorithm)
+        stored = self._asked(self.priors[0], {}, self.trial_seeds).model_dump(mode="json")
+        known = {**stored["algorithm_settings"], **stored["network"], **stored["prior"]}
+        return {name: tried for name, tried in self.space.items() if known.get(name.rpartition(".")[2]) is not None}
 
     def without_effect(self, prior: str) -> frozenset[str]:
         """Return the settings that change nothing with a prior, at the defaults and at each value that is checked."""
@@ -75,11 +84,9 @@ class Tuning(Strict):
         configs = (self._asked(prior, settings, self.trial_seeds) for settings in ({}, *tried))
         return frozenset.intersection(*(config.without_effect() for config in configs))
 
-    def check(self, seeds: Sequence[int]) -> None:
-        """Refuse what cannot be run; `seeds` are those of the runs that judge the best settings."""
-        shared = set(seeds) & set(self.trial_seeds)
-        if shared:
-            raise UserError(f"seed {min(shared)} belongs to the trials; choose --seeds that no trial has")
+    def _check(self) -> None:
+        """Refuse what cannot be run."""
+        self.refuse_trial_seeds()
         if "prior.kind" in self.overrides or "prior.kind" in self.space:
             raise UserError("a tuning takes the kinds of prior by --prior, not by --set or --space")
         effective, searched = set[str](), set[str]()
@@ -91,7 +98,9 @@ class Tuning(Strict):
                     "a setting of the learner, or leave this prior out"
                 )
             for name, dimension in space.items():
-                self._check_setting(prior, name, dimension)
+                self._refuse_given(name)
+                for value in dimension.corners():
+                    self._asked(prior, {name: value}, self.trial_seeds)
             searched |= space.keys()
             effective |= space.keys() - self.without_effect(prior)
         if idle := sorted(searched - effective):
@@ -99,8 +108,8 @@ class Tuning(Strict):
                 f"the space varies '{idle[0]}', which is without effect beside the other settings; leave it out"
             )
 
-    def _check_setting(self, prior: str, name: str, dimension: Dimension) -> None:
-        """Refuse a setting that is not the learner's, that --set fixes, or that does not take each value."""
+    def _refuse_given(self, name: str) -> None:
+        """Refuse a setting that is not the learner's, or that --set fixes."""
         if name.partition(".")[0] in _GIVEN:
             raise UserError(
                 f"the space varies '{name}', and then trials are not scored alike; leave it out, and fix it by "
@@ -108,88 +117,66 @@ class Tuning(Strict):
             )
         if name in self.overrides:
             raise UserError(f"--set {name} fixes what the space varies; leave it out, or use another --space")
-        for value in dimension.corners():
-            self.config(prior, {name: value})
 
+    def _draws(self, budget: int) -> list[dict[str, object]]:
+        """Return the default settings, and then those drawn that go together and are new."""
+        generator, found, tried = random.Random(0), list[dict[str, object]]([{}]), count(1)
+        while len(found) < budget and next(tried) <= _TRIES * budget:
+            settings = dict[str, object](drawn(self.space, generator))
+            try:
+                for prior in self.priors if settings not in found else ():
+                    build_learner(self.config(prior, settings, self.trial_seeds).of_one_seed())
+            except UserError as error:
+                self.refused.append(str(error))
+            else:
+                found += [settings] if settings not in found else []
+        return found
 
-TUNING_FORMAT = DocumentFormat("esp-tuning", 1, "a tuning of settings")
+    def trial(self, candidate: Candidate, draw: int) -> Cell:
+        prior = self.priors[self.candidates.index(candidate)]
+        return Cell(
+            name=f"{prior}-{draw:03d}",
+            panel=f"{self.task}, {format_count(self.steps)}",
+            variant=f"{NAMES[prior]}, trial {draw}",
+            config=self.config(prior, self.draws[draw], self.trial_seeds),
+        )
 
+    def fresh(self, best: Mapping[Candidate, int]) -> list[Cell]:
+        """Return for each kind of prior the run of the default settings and that of the best, which judge it.
 
-@dataclass(frozen=True)
-class Outcome:
-    """What came out for one prior."""
+        Default settings are compared with those of the plain learner, tuned ones with the tuned plain learner. Where
+        that is missing or the run itself, tuned settings are compared with the default ones.
+        """
+        panel = f"{self.task}, {self.algorithm.upper()}, {format_count(self.steps)}"
 
-    prior: str
-    trials: int  # that were begun
-    completed: int  # trials with a score
-    pruned: int  # trials that were ended early or broke
-    refused: tuple[str, ...]  # why settings did not go together, one text for each such trial; they count as pruned
-    env_steps: int  # of all seeds of all trials
-    seconds: float  # of training, all trials added up
-    best: int | None  # number of the best trial; None where no trial has a score
-    best_score: float | None  # of its curve, on the seeds of the trials
-    default_score: float | None  # of the default settings; None where the space does not hold them all
-    settings: Mapping[str, object]  # of the best trial
+        def cell(variant: str, config: RunConfig, beside: Cell | None) -> Cell:
+            reference = None if beside is None else beside.name
+            return Cell(name=file_name(variant), panel=panel, variant=variant, config=config, reference=reference)
 
+        cells: list[Cell] = []
+        plain: tuple[Cell, Cell] | None = None  # with the default settings and with the best
+        for prior in sorted(self.priors, key=lambda name: name != "none"):
+            name, number = NAMES[prior], best.get((self.task, NAMES[prior]))
+            config = self.config(prior, {}, self.request.seeds)
+            default = tuned = cell(f"{name}, default", config, plain and plain[0])
+            cells.append(default)
+            # beside a tuned plain learner the best settings stand though they are the default ones
+            if number or (number == 0 and plain is not None and plain[0] != plain[1]):
+                config = self.config(prior, self.draws[number], self.request.seeds)
+                tuned = cell(f"{name}, tuned (trial {number})", config, plain[1] if plain else default)
+                cells.append(tuned)
+            if prior == "none":
+                plain = default, tuned
+        return cells
 
-@dataclass(frozen=True)
-class Point:
-    """An evaluation of a trial."""
-
-    step: int  # environment steps per seed
-    mean: float  # greedy return, mean over the seeds; NaN where a seed stopped
-    value: float  # mean of the newest evaluations up to this one
-
-
-def curve_of(metrics: Path) -> list[Point]:
-    """Return the evaluations of a trial by its metrics file; none before it has begun."""
-    rows = [row for row in read_metrics(metrics) if "eval/return_greedy" in row] if metrics.exists() else []
-    if not rows:
-        return []
-    steps, returns = column(rows, "eval/return_greedy")
-    means = returns.mean(1).tolist()
-    recent = [means[max(0, k + 1 - SMOOTHED) : k + 1] for k in range(len(means))]
-    return [Point(int(step), means[k], math.fsum(recent[k]) / len(recent[k])) for k, step in enumerate(steps)]
-
-
-def score(curve: Sequence[Point]) -> float | None:
-    """Return the score of a curve, its last value; None where that is not finite."""
-    return curve[-1].value if curve and math.isfinite(curve[-1].value) else None
-
-
-def fresh_study(
-    tuning: Tuning, best: Mapping[str, tuple[int, Mapping[str, object]]], seeds: Sequence[int], episodes: int
-) -> Study:
-    """Plan the study that evaluates the best settings of each prior, beside the default ones, on seeds of its own.
-
-    Default settings are compared with those of the plain learner, tuned ones with the tuned plain learner. Where that
-    is missing or the run itself, tuned settings are compared with the default ones. `best` holds by prior the number of
-    the best trial and its settings; a prior without a score is left out.
-    """
-    panel = f"{tuning.task}, {tuning.algorithm.upper()}, {format_count(tuning.steps)}"
-
-    def cell(variant: str, config: RunConfig, beside: Cell | None) -> Cell:
-        reference = None if beside is None else beside.name
-        return Cell(name=file_name(variant), panel=panel, variant=variant, config=config, reference=reference)
-
-    cells: list[Cell] = []
-    plain: tuple[Cell, Cell] | None = None  # with the default settings and with the best
-    for prior in sorted(tuning.priors, key=lambda name: name != "none"):
-        default = tuned = cell(f"{NAMES[prior]}, default", tuning.config(prior, {}, seeds), plain and plain[0])
-        cells.append(default)
-        number, settings = best.get(prior, (0, {}))
-        config = tuning.config(prior, settings, seeds)
-        # else the default settings were the best, or nothing was; beside a tuned plain learner the best stand anyway
-        if config != default.config or (prior in best and plain is not None and plain[0] != plain[1]):
-            tuned = cell(f"{NAMES[prior]}, tuned (trial {number})", config, plain[1] if plain else default)
-            cells.append(tuned)
-        if prior == "none":
-            plain = default, tuned
-    return Study(
-        kind="tuned",
-        title=f"Tuned settings of {tuning.algorithm.upper()} on {tuning.task}, judged on fresh seeds",
-        command=tuning.command,
-        episodes=episodes,
-        rows="variants",
-        cells=tuple(cells),
-    )
+    def judged(self, trials: Trials) -> Study:
+        """Plan what judges, and write the best settings of each kind of prior for `esp train --config`."""
+        study, best = super().judged(trials), self.best(trials)
+        for prior in self.priors:
+            if (number := best.get((self.task, NAMES[prior]))) is not None:
+                own = {name: self.draws[number][name] for name in space_of(self.space, prior) if number}
+                whole = {"task": self.task, "algorithm": self.algorithm, "preset": self.request.preset}
+                document = {**whole, "steps": self.steps, **self.overrides, "prior.kind": prior, **own}
+                text = json.dumps(document, indent=2) + "\n"
+                replace_file(trials.path / f"preset-{prior}.json", text.encode())
+        return study

@@ -10,10 +10,8 @@ from PIL import Image
 
 from esp_cli.files.formatting import format_mean
 from esp_cli.policies.statistics import mean_and_sem
-from esp_cli.studies.study import STUDY_FORMAT, StudyFolder
-from esp_cli.studies.tuning import TUNING_FORMAT
+from esp_cli.studies.plan import STUDY_FORMAT
 from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
-from esp_cli.training.folder_names import TUNING
 from tests.cli.running import DAMAGE, esp, refused, train_tiny
 
 
@@ -150,10 +148,10 @@ def test_a_folder_may_have_an_equals_sign_in_its_name(finished: Path, copied: Pa
 def test_what_a_run_or_a_study_needs_is_not_overwritten_by_a_report(copied: Path, tmp_path: Path, option: str) -> None:
     study = tmp_path / "study"
     study.mkdir()
-    STUDY_FORMAT.write(study / StudyFolder.document, {})
+    STUDY_FORMAT.write(study / "study.json", {})
     (tmp_path / "link.csv").symlink_to(copied / "metrics.jsonl")
     needed = [copied / "config.json", copied / "metrics.jsonl", copied / "policy.safetensors"]
-    for file in (*needed, study / StudyFolder.document, tmp_path / "link.csv"):
+    for file in (*needed, study / "study.json", tmp_path / "link.csv"):
         before = file.read_bytes()
         assert f"{file} belongs to the run or study in" in refused("report", copied, option, file)
         assert file.read_bytes() == before
@@ -175,10 +173,3 @@ def test_runs_of_two_versions_of_a_task_are_refused_and_a_run_states_its_own(fin
     tensors, meta = load_checkpoint(checkpoint)
     save_checkpoint(checkpoint, tensors, meta | {"task_version": 2})
     assert "were trained on versions 1 and 2 of navigation" in refused("report", finished, copied)
-
-
-def test_the_report_of_a_tuning_is_not_taken_for_a_tuning(tmp_path: Path) -> None:
-    TUNING_FORMAT.write(tmp_path / TUNING, {})
-    assert f"holds trials; report what judges them by: esp report {tmp_path}/fresh" in refused("report", tmp_path)
-    (tmp_path / TUNING).write_text("{}")
-    assert "is no run folder" in refused("report", tmp_path)

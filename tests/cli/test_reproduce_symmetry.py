@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from esp_cli import app
+from esp_cli.studies.search import Trials
 from esp_cli.studies.study import StudyFolder
-from esp_cli.studies.symmetry import Trials
 from esp_cli.training import trainer
 from tests.cli.running import TINY_OPTIONS, esp, refused
 from tests.forks import fork, killed, said, wait
@@ -28,7 +28,7 @@ def test_a_dry_run_states_the_cost_of_each_method_and_makes_nothing(tmp_path: Pa
         "navigation-500-sets-esp": (500, 2),
     }
     assert found["core_seconds"] == pytest.approx(sum(run["seconds"] for run in found["runs"]))
-    assert "2 trials of each, and the run that judges it: " in esp(*words).stdout
+    assert "2 trials of each, and the runs that judge: " in esp(*words).stdout
     assert not (tmp_path / "s").exists()
     assert "is not empty and no study" in refused(*words, "--out", Path(__file__).parent)
 

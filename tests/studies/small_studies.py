@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from esp_cli.studies.catalogue import Request, plan
-from esp_cli.studies.run_set import Cell
-from esp_cli.studies.study import Study, StudyFolder
+from esp_cli.studies.plan import Cell, Study
+from esp_cli.studies.study import StudyFolder
 from tests.training.runs import TINY
 
 ANCHORS = {"random": -200.0, "heuristic": -100.0}

@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -23,7 +22,6 @@ from ray.cluster_utils import Cluster
 from esp_cli.files.opening import is_held
 from esp_cli.run import Run
 from esp_cli.studies import engine_ray
-from esp_cli.studies.engine import Engine, LocalEngine
 from esp_cli.studies.engine_ray import (
     CLUSTER_FORMAT,
     RayEngine,
@@ -32,15 +30,14 @@ from esp_cli.studies.engine_ray import (
     run_job,
     versions,
 )
-from esp_cli.studies.run_set import Cell
+from esp_cli.studies.plan import Cell, Study
 from esp_cli.studies.scheduler import Scheduler
-from esp_cli.studies.study import Study, StudyFolder
+from esp_cli.studies.study import StudyFolder
 from esp_cli.training.metrics import read_metrics
 from esp_cli.training.run_folder import RunFolder, checkpoints_in, step_of
 from esp_envs.errors import UserError
 from tests.cli.running import TINY_OPTIONS
 from tests.studies.small_studies import small_study
-from tests.studies.test_tuning import tuning
 from tests.training.runs import TINY
 
 pytestmark = pytest.mark.slow
@@ -289,26 +286,3 @@ def test_a_cluster_that_does_not_answer_is_refused_in_one_sentence(folder: Study
             UserError, match=rf"cannot use the Ray cluster at {address} \(.*{reason}\); check --address"
         ):
             RayEngine(folder.path, address)
-
-
-def test_a_search_on_a_cluster_goes_on_after_a_stop_and_scores_as_on_this_machine(cluster, tmp_path, monkeypatch):
-    pytest.importorskip("optuna", reason="needs Optuna, of the extra tune")
-    from esp_cli.studies.search import Outcome, Search
-
-    monkeypatch.setenv("ESP_CHECKPOINT_SECONDS", "0")
-    asked = tuning(priors=("esp",), budget=2, steps=2 * STEPS)  # long enough to be stopped on the way
-
-    def searched(path: Path, engine: Engine) -> Outcome:
-        first = path / "trials" / "esp-000"
-        for until in (lambda _: not any(first.glob("checkpoints/step-*.safetensors")), lambda _: True):
-            assert not (first / "policy.safetensors").exists()
-            search = Search.create(path, asked)
-            Scheduler(search, search.cells, 1, engine).run(until, 0.05)
-        return search.outcome("esp")
-
-    here = searched(tmp_path / "here", LocalEngine())
-    with RayEngine(tmp_path / "there", cluster.address) as engine:
-        there = searched(tmp_path / "there", engine)
-    assert there.trials == 2
-    # a trial that is pruned ends some steps after it was judged
-    assert replace(there, seconds=0.0, env_steps=0) == replace(here, seconds=0.0, env_steps=0)

@@ -9,9 +9,8 @@ import torch
 from esp_cli.studies import forecast as module
 from esp_cli.studies.forecast import Cost, forecast_tuned
 from esp_cli.studies.forecast import forecast_study as forecast
-from esp_cli.studies.run_set import Cell
+from esp_cli.studies.search import Trials
 from esp_cli.studies.study import StudyFolder
-from esp_cli.studies.symmetry import Trials
 from tests.studies.small_studies import small_study, write_run
 from tests.studies.test_tuning import tuning
 from tests.training.runs import tiny_config
@@ -82,15 +81,12 @@ def test_a_finished_run_is_not_measured(tmp_path: Path, probed: list[str]) -> No
 def test_the_forecast_of_a_search_by_hand(tmp_path: Path, probed: list[str]) -> None:
     """Each prior: 6 trials of 100 s, and then a run of 104 s."""
     asked, path = tuning(budget=6), tmp_path / "s"
-    cells = {
-        prior: [Cell(name=f"{prior}-{k}", panel=prior, variant=prior, config=asked.config(prior, {})) for k in range(6)]
-        for prior in asked.priors
-    }
-    trials = Trials(path, small_study().model_copy(update={"cells": (*cells["esp"], *cells["none"])}))
+    trials, _ = Trials.planned(path, asked.trials)
     fresh = StudyFolder(path / "fresh", small_study())
     for jobs, seconds in ((1, 12 * 100.0 + 208.0), (2, 600.0 + 104.0), (99, 100.0 + 104.0)):
         judged = forecast(fresh, [], jobs, lambda done: None)
-        found = forecast_tuned(trials, cells, judged, lambda done: None)
+        groups = {": ".join(one): cells for one, cells in asked.trials_of.items()}
+        found = forecast_tuned(trials, groups, judged, lambda done: None)
         assert [run.seconds for run in found.runs] == [600.0] * 2 + [104.0] * 2
         assert (found.core_seconds, found.seconds) == (12 * 100.0 + 208.0, seconds)
 

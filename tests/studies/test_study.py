@@ -260,7 +260,7 @@ def test_a_study_killed_while_its_first_document_is_written_goes_on(tmp_path):
         assert [path.name for path in tmp_path.iterdir()] == ["study.lock"]
     (tmp_path / "fresh").mkdir()
     (tmp_path / "fresh" / f"{TEMPORARY_PREFIX}0").write_text("half")
-    (tmp_path / StudyFolder.document).write_text("{}")
+    (tmp_path / "study.json").write_text("{}")
     with StudyFolder.held(tmp_path):
         StudyFolder.create(tmp_path / "fresh", small_study())
         assert [path.name for path in (tmp_path / "fresh").iterdir()] == ["study.json"]

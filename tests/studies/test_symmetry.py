@@ -13,8 +13,9 @@ from esp_cli.reporting.page import answer
 from esp_cli.reporting.results import summarised
 from esp_cli.reporting.tables import TABLES
 from esp_cli.studies.catalogue import Request
+from esp_cli.studies.search import Trials, score
 from esp_cli.studies.study import StudyFolder
-from esp_cli.studies.symmetry import METHODS, TASKS, TRIAL_SEEDS, Benchmark, Trials, draws, score
+from esp_cli.studies.symmetry import METHODS, TASKS, Benchmark, draws
 from esp_envs import make
 from esp_envs.errors import UserError
 from tests.studies.small_studies import write_run
@@ -59,7 +60,7 @@ def test_the_score_is_the_mean_of_the_last_two_evaluations(tmp_path: Path) -> No
 def test_a_trial_has_its_own_seeds_and_fewer_steps_and_only_what_counts_is_drawn() -> None:
     asked = benchmark(overrides={"mappo.num_epochs": 7})
     first, second = (asked.config("navigation", "plain", draw, trial=True) for draw in (0, 1))
-    assert (first.seeds, first.steps, first.preset) == (TRIAL_SEEDS, 60_000, "fast")
+    assert (first.seeds, first.steps, first.preset) == ((100, 101, 102), 60_000, "fast")
     assert (second.algorithm_settings["learning_rate"], second.algorithm_settings["num_epochs"]) == (0.008, 7)
     judged = asked.config("navigation", "ESP", 1, trial=False)
     assert (judged.seeds, judged.steps, judged.prior.consistency_coef) == ((0, 1, 2, 3), 200_000, 0.3)
@@ -86,7 +87,7 @@ def test_a_broken_task_has_less_symmetry_and_differs_in_one_setting(task: str, w
 
 def test_what_a_task_cannot_take_is_left_out_with_a_reason_and_the_first_taken_is_the_reference(tmp_path):
     asked = benchmark(tasks=("wildlife",), variants=("local frames", "plain", "frame averages"), budget=1)
-    assert asked.taken == (("wildlife", "plain"), ("wildlife", "frame averages"))
+    assert asked.candidates == (("wildlife", "plain"), ("wildlife", "frame averages"))
     reason = asked.left_out["wildlife: local frames"]
     assert reason == "network.symmetrise=local-d4 is for networks without memory and messages; use d4"
     study = asked.judged(write_trials(tmp_path / "s", asked, {}))
@@ -97,7 +98,7 @@ def test_what_a_task_cannot_take_is_left_out_with_a_reason_and_the_first_taken_i
 
 
 def test_every_method_is_taken_somewhere() -> None:
-    assert {method for _, method in benchmark(variants=None, budget=1).taken} == set(METHODS)
+    assert {method for _, method in benchmark(variants=None, budget=1).candidates} == set(METHODS)
 
 
 def test_the_best_trial_is_judged_and_the_first_of_equal_ones(tmp_path: Path) -> None:

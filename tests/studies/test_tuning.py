@@ -1,69 +1,84 @@
-"""What tuning tries and how it scores: spaces, curves, budgets, and the study that judges the best settings."""
+"""What tuning tries: spaces, draws, budgets, and the study that judges the best settings."""
 
 import json
-import math
+import random
 import re
 
 import pytest
 
 from esp_cli.algorithms.presets import ALGORITHMS
-from esp_cli.studies import symmetry
-from esp_cli.studies.tuning import TUNING_FORMAT, Point, Tuning, curve_of, fresh_study, score
-from esp_cli.studies.tuning_space import Dimension, default_space, read_space, space_of
-from esp_cli.training.metrics import MetricsError
+from esp_cli.studies.catalogue import Request
+from esp_cli.studies.search import Trials
+from esp_cli.studies.space import Dimension, default_space, drawn, read_space
+from esp_cli.studies.tuning import Tuning
 from esp_envs.errors import UserError
+from tests.studies.test_symmetry import write_trials
 from tests.training.runs import TINY
 
 SPACE = {"mappo.learning_rate": Dimension(low=1e-4, high=1e-1, log=True), "mappo.gamma": Dimension(choices=(0.9, 0.99))}
-UNFIXED = {name: value for name, value in TINY.items() if name not in ("mappo.num_envs", "mappo.num_minibatches")}
+WHOLE = {**SPACE, "prior.consistency_coef": Dimension(low=0.1, high=1.0)}
+BOTH = ("esp", "none")
 
 
-def tuning(**changes) -> Tuning:
-    plain = {
-        "task": "navigation",
-        "algorithm": "mappo",
-        "priors": ("esp", "none"),
-        "budget": 4,
-        "steps": 900,
-        "trial_seeds": (1000, 1001),
-        "overrides": {"network.name": "mlp", **TINY},
-        "space": SPACE | {"prior.consistency_coef": Dimension(low=0.1, high=1.0)},
-        "command": "esp tune",
-    }
-    return Tuning(**(plain | changes))
+def tuning(priors=BOTH, budget=4, space=WHOLE, **choice) -> Tuning:
+    """Return a search of navigation in a space, or in the default one."""
+    plain = {"tasks": ("navigation",), "steps": ((None, 900),), "seeds": (0, 1), "command": "esp tune"}
+    plain["overrides"] = {"network.name": "mlp", **TINY}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("esp_cli.studies.tuning.read_space", lambda _: space)
+        return Tuning(Request(**(plain | choice)), priors, budget, 2, "a file" if space else None)
 
 
-def points(*means: float) -> list[Point]:
-    return [Point(100 * k, mean, mean) for k, mean in enumerate(means)]
+def best(asked: Tuning, tmp_path, **scores: int) -> dict[tuple[str, str], int]:
+    """Return the best draws where the trials of each kind of prior with these numbers score higher than the others."""
+    ends = {f"{prior}-{number:03d}": 5.0 for prior, number in scores.items()}
+    return asked.best(write_trials(tmp_path / "s", asked, ends))
 
 
 @pytest.mark.parametrize("algorithm", ["mappo", "maddpg", "qmix"])
-def test_every_algorithm_has_a_space_whose_corners_are_settings_that_it_takes(algorithm):
+def test_every_algorithm_has_a_space_of_settings_that_it_takes_and_a_run_has(algorithm):
     assert algorithm in ALGORITHMS
     for task in ("navigation", "predator-prey", "wildlife"):
-        asked = tuning(task=task, algorithm=algorithm, overrides={}, space=default_space(algorithm))
-        (searched := asked.around_defaults()).check((0, 1))
-        assert ("network.activation" in searched.space) == (task != "wildlife"), "what its network has"
-    without = space_of(default_space(algorithm), "none")
-    assert set(default_space(algorithm)) - set(without) == {"prior.consistency_coef"}
+        asked = tuning(tasks=(task,), algorithms=(algorithm,), overrides={}, space=None, budget=2)
+        assert ("network.activation" in asked.space) == (task != "wildlife"), "what its network has"
+        assert {f"{algorithm}.gamma", f"{algorithm}.learning_rate"} < set(asked.space) <= set(default_space(algorithm))
+        plain, prior = (asked.trials_of[task, name][1].config for name in ("plain", "ESP"))
+        assert plain.algorithm_settings == prior.algorithm_settings, "both sides try the same"
+        assert prior.prior.consistency_coef == asked.draws[1]["prior.consistency_coef"]
 
 
-def test_the_default_space_is_widened_to_hold_the_defaults_of_the_task():
-    given = default_space("mappo")
-    searched = tuning(task="navigation", algorithm="mappo", overrides={}, space=given).around_defaults()
-    values = searched.default_values("esp", given)
-    assert given["mappo.learning_rate"].holding(0.04) == Dimension(low=1e-4, high=0.04, log=True)
-    assert searched.space["network.hidden"].choices == ([64], [64, 64], [128, 128])
-    assert searched.space["mappo.entropy_coef"] == given["mappo.entropy_coef"]
-    assert all(searched.space[name].encoded(value) is not None for name, value in values.items())
-    assert Dimension(low=0.1, high=1.0, log=True).holding(0.0).low == 0.1, "no logarithm"
+def test_ranges_are_drawn_evenly_or_by_orders_of_magnitude():
+    space = {
+        "even": Dimension(low=0.0, high=10.0),
+        "log": Dimension(low=1e-4, high=1.0, log=True),
+        "whole": Dimension(low=3, high=5),
+        "orders": Dimension(low=1, high=1000, log=True),
+        "choice": Dimension(choices=("a", [1, 2])),
+    }
+    generator = random.Random(0)
+    found = [drawn(space, generator) for _ in range(2000)]
+    assert sum(one["even"] < 2.5 for one in found) / 2000 == pytest.approx(0.25, abs=0.04)
+    assert sum(one["log"] < 1e-3 for one in found) / 2000 == pytest.approx(0.25, abs=0.04)
+    assert all(0 <= one["even"] <= 10 and 1e-4 <= one["log"] <= 1 and 1 <= one["orders"] <= 1000 for one in found)
+    assert {one["whole"] for one in found} == {3, 4, 5}
+    assert {type(one["orders"]) for one in found} == {int}
+    assert {str(one["choice"]) for one in found} == {"a", "[1, 2]"}
 
 
-@pytest.mark.parametrize("algorithm", symmetry.SPACES)
-def test_the_default_space_holds_all_that_the_benchmark_tries(algorithm):
-    space = default_space(algorithm)
-    for name, values in symmetry.SPACES[algorithm].items():
-        assert [value for value in values if space[f"{algorithm}.{name}"].encoded(value) is None] == []
+def test_trials_have_the_same_draws_whatever_the_budget_and_the_first_the_defaults():
+    few, many = tuning(budget=2), tuning(budget=6)
+    assert many.draws[:2] == few.draws
+    assert (many.draws[0], len(many.draws)) == ({}, 6)
+    first = many.trials_of["navigation", "ESP"][0]
+    assert (first.name, first.config.seeds, first.config.steps) == ("esp-000", (100, 101), 900)
+
+
+def test_settings_that_do_not_go_together_and_repeated_ones_are_drawn_again():
+    worlds = {"mappo.num_minibatches": Dimension(choices=(1, 2, 4096))}  # more of them than steps in a batch
+    asked = tuning(space=worlds, overrides={"network.name": "mlp", "mappo.num_envs": 8}, budget=9)
+    assert sorted(one.get("mappo.num_minibatches", 0) for one in asked.draws) == [0, 1, 2]
+    assert all("num_minibatches" in reason for reason in asked.refused)
+    assert asked.refused
 
 
 def test_an_algorithm_without_a_space_asks_for_one():
@@ -134,89 +149,77 @@ def test_a_space_that_says_nothing_is_refused(tmp_path, text, sentence):
 )
 def test_what_cannot_be_run_is_refused_before_anything_is(changes, sentence):
     with pytest.raises(ValueError, match=sentence):
-        tuning(**changes).check((0, 1))
+        tuning(**changes)
 
 
 def test_a_setting_that_another_one_of_the_space_gives_an_effect_is_searched():
     doubt = {"prior.doubt": Dimension(low=1.0, high=9.0)}
-    with pytest.raises(ValueError, match=r"varies 'prior\.doubt', which is without effect"):
-        tuning(priors=("esp",), space=doubt).check((0, 1))
-    tuning(priors=("esp",), space=doubt | {"prior.trust": Dimension(choices=("full", "measured"))}).check((0, 1))
+    with pytest.raises(UserError, match=r"varies 'prior\.doubt', which is without effect"):
+        tuning(priors=("esp",), space=doubt)
+    tuning(priors=("esp",), space=doubt | {"prior.trust": Dimension(choices=("full", "measured"))})
 
 
 def test_a_setting_of_the_task_may_be_fixed_though_none_is_searched():
-    tuning(overrides={"task.num_agents": 2, "evaluation.episodes": 2}).check((0, 1))
+    assert tuning(overrides={"navigation.num_agents": 2, "evaluation.episodes": 2}).overrides["task.num_agents"] == 2
 
 
 def test_what_a_prior_leaves_to_be_measured_is_measured_for_every_trial():
-    found = tuning(overrides={"task.wind": 0.3}, priors=("auto",))
-    found.check((0, 1))
-    prior = found.config("auto", {}).prior
-    assert (prior.kind, prior.trust, prior.weights["flip-x"]) == ("esp", "measured", 1.0)
-    assert prior.weights["rot180"] < 0.1
+    asked = tuning(overrides={"task.wind": 0.3, "network.name": "mlp"}, priors=("auto",), budget=2)
+    for cell in asked.trials.cells:
+        prior = cell.config.prior
+        assert (prior.kind, prior.trust, prior.weights["flip-x"]) == ("esp", "measured", 1.0)
+        assert prior.weights["rot180"] < 0.1
 
 
-def test_a_curve_is_scored_by_its_end():
-    assert score(points(-30.0, -20.0, -10.0, -12.0)) == -12.0
-    assert score(points(-30.0, math.nan)) is None
-    assert score([]) is None
-
-
-def test_a_tuning_of_an_earlier_version_loads_unless_it_was_for_steps_or_seconds(tmp_path):
-    path, stored = tmp_path / "tuning.json", tuning().model_dump(mode="json")
-    TUNING_FORMAT.write(path, stored | {"goal": "return", "reach": None})
-    assert TUNING_FORMAT.parse(path, Tuning) == tuning()
-    TUNING_FORMAT.write(path, stored | {"goal": "steps", "reach": -15.0})
-    with pytest.raises(UserError, match=r"tuning\.json: this esp has no 'goal' any more; use the esp that wrote it"):
-        TUNING_FORMAT.parse(path, Tuning)
-
-
-def test_the_value_of_a_point_is_the_mean_of_the_newest_evaluations(tmp_path):
-    path = tmp_path / "metrics.jsonl"
-    rows = [{"step": 100 * k, "eval/return_greedy": [-8.0 * k, 0.0]} for k in range(5)]
-    rows.insert(1, {"step": 50})
-    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
-    found = curve_of(path)
-    assert [point.step for point in found] == [0, 100, 200, 300, 400]
-    assert [point.mean for point in found] == [0.0, -4.0, -8.0, -12.0, -16.0]
-    assert [point.value for point in found] == [0.0, -2.0, -4.0, -8.0, -12.0]
-    assert curve_of(tmp_path / "none") == []
-    path.write_text('{"step": 0}\nno row\n{"step": 1}\n')
-    with pytest.raises(MetricsError, match=r"metrics\.jsonl is damaged: line 2"):
-        curve_of(path)
-
-
-def test_the_best_settings_are_judged_beside_the_default_ones_on_other_seeds():
-    best = {"esp": (3, {"mappo.learning_rate": 0.002}), "none": (0, {})}
-    study = fresh_study(tuning(), best, (0, 1), 4)
+def test_the_best_settings_are_judged_beside_the_default_ones_on_other_seeds(tmp_path):
+    asked = tuning()
     # trial 0 of the plain learner has the default settings, so that it is both
-    assert [cell.variant for cell in study.cells] == ["plain, default", "ESP, default", "ESP, tuned (trial 3)"]
-    assert {cell.config.seeds for cell in study.cells} == {(0, 1)}
-    assert study.cells[2].config.algorithm_settings["learning_rate"] == 0.002
-    assert [cell.reference for cell in study.cells] == [None, "plain-default", "plain-default"]
-    later = fresh_study(tuning(), best | {"esp": (5, {"mappo.learning_rate": 0.003})}, (0, 1), 4)
-    assert later.cells[:2] == study.cells[:2], "another best adds a cell and changes no other"
-    with pytest.raises(ValueError, match="seed 1001 belongs to the trials"):
-        tuning().check((0, 1001))
+    cells = plain, default, tuned = asked.fresh(best(asked, tmp_path, esp=3, none=0))
+    assert [cell.variant for cell in cells] == ["plain, default", "ESP, default", "ESP, tuned (trial 3)"]
+    assert {cell.config.seeds for cell in cells} == {(0, 1)}
+    assert tuned.config.algorithm_settings["learning_rate"] == asked.draws[3]["mappo.learning_rate"]
+    assert [cell.reference for cell in cells] == [None, "plain-default", "plain-default"]
+    later = asked.fresh({("navigation", "plain"): 0, ("navigation", "ESP"): 2})
+    assert later[:2] == [plain, default], "another best adds a cell and changes no other"
+    with pytest.raises(UserError, match="seed 101 belongs to the trials"):
+        tuning(seeds=(0, 101))
 
 
-def test_tuned_is_compared_with_tuned_and_default_with_default():
-    faster, slower = ({"mappo.learning_rate": rate} for rate in (0.002, 0.0002))
-    study = fresh_study(tuning(), {"esp": (3, faster), "none": (2, slower)}, (0, 1), 4)
-    assert {cell.name: cell.reference for cell in study.cells} == {
+def test_tuned_is_compared_with_tuned_and_default_with_default(tmp_path):
+    def references(priors=BOTH, **numbers: int) -> dict[str, str | None]:
+        asked = tuning(priors=priors)
+        names = {"esp": ("navigation", "ESP"), "none": ("navigation", "plain")}
+        return {cell.name: cell.reference for cell in asked.fresh({names[one]: n for one, n in numbers.items()})}
+
+    assert references(esp=3, none=2) == {
         "plain-default": None,
         "plain-tuned-trial-2": "plain-default",
         "esp-default": "plain-default",
         "esp-tuned-trial-3": "plain-tuned-trial-2",
     }
-    equal = fresh_study(tuning(), {"esp": (0, {}), "none": (2, slower)}, (0, 1), 4)
-    assert (equal.cells[3].name, equal.cells[3].reference) == ("esp-tuned-trial-0", "plain-tuned-trial-2")
-    assert equal.cells[3].config == equal.cells[2].config, "so that it is trained once"
-    alone = fresh_study(tuning(priors=("esp",)), {"esp": (3, faster)}, (0, 1), 4)
-    assert {cell.name: cell.reference for cell in alone.cells} == {
-        "esp-default": None,
-        "esp-tuned-trial-3": "esp-default",
-    }
-    without = fresh_study(tuning(), {"esp": (3, faster)}, (0, 1), 4)
-    assert [cell.name for cell in without.cells] == ["plain-default", "esp-default", "esp-tuned-trial-3"]
-    assert without.cells[2].reference == "plain-default"
+    assert references(esp=0, none=2)["esp-tuned-trial-0"] == "plain-tuned-trial-2"
+    assert references(("esp",), esp=3) == {"esp-default": None, "esp-tuned-trial-3": "esp-default"}
+    assert references(esp=3)["esp-tuned-trial-3"] == "plain-default"
+
+
+def test_the_best_settings_are_written_for_training_and_all_scores_are_on_file(tmp_path):
+    asked = tuning(overrides={"network.name": "mlp"})
+    study = asked.judged(write_trials(tmp_path / "s", asked, {"esp-003": 5.0, "none-000": 5.0}))
+    assert (study.kind, study.rows, len(study.cells)) == ("tuned", "variants", 3)
+    written = {name: json.loads((tmp_path / "s" / f"preset-{name}.json").read_text()) for name in BOTH}
+    assert written["none"] == {
+        "task": "navigation", "algorithm": "mappo", "preset": "default", "steps": 900, "network.name": "mlp",
+        "prior.kind": "none",
+    }  # fmt: skip
+    assert written["esp"] == written["none"] | {"prior.kind": "esp"} | asked.draws[3]
+    trials = json.loads((tmp_path / "s" / "trials.json").read_text())
+    assert trials["scores"] == {"navigation: ESP": [0.0, 0.0, 0.0, 5.0], "navigation: plain": [5.0, 0.0, 0.0, 0.0]}
+    assert (trials["draws"], trials["seeds"]) == (asked.draws, [100, 101])
+
+
+def test_a_longer_search_goes_on_in_its_folder_and_one_in_another_space_does_not(tmp_path):
+    write_trials(tmp_path / "s", tuning(), {})
+    assert len(Trials.create(tmp_path / "s", tuning(budget=5).trials).study.cells) == 10
+    other = tuning(space={"mappo.gamma": Dimension(low=0.5, high=0.6)})
+    with pytest.raises(UserError, match=r"holds another study .esp-001 has other seeds or settings"):
+        Trials.create(tmp_path / "s", other.trials)

@@ -23,12 +23,10 @@ from esp_cli.files.documents import DocumentFormat, parse_object
 from esp_cli.policies.bundled import MANIFEST, MANIFEST_FORMAT, Manifest, bundled_folder
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.reporting.results import read_results
-from esp_cli.reporting.tuning_page import budget_table
 from esp_cli.studies.catalogue import plan
-from esp_cli.studies.search import Search
-from esp_cli.studies.study import STUDY_FORMAT, StudyFolder, read_evaluation
-from esp_cli.studies.tuning import TUNING_FORMAT, Tuning
-from esp_cli.studies.tuning_space import read_space
+from esp_cli.studies.plan import STUDY_FORMAT
+from esp_cli.studies.space import read_space
+from esp_cli.studies.study import StudyFolder, read_evaluation
 from esp_cli.symmetry.admission import admitted_elements
 from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
 from esp_cli.training.config import resolve_config
@@ -39,8 +37,6 @@ from esp_cli.training.trainer import Trainer
 from esp_envs.registry import make
 from esp_envs.spec import TaskSpec
 from tests.studies.small_studies import request
-from tests.studies.test_tuner import search
-from tests.studies.test_tuning import tuning
 from tests.torture.junk import spoil_bytes, spoil_header, spoil_json, spoil_value
 from tests.torture.limits import PROCESSOR_S, TooLongError, time_limit
 from tests.torture.record import Part
@@ -54,7 +50,6 @@ FORGED_SHARE = 1 / 100
 RUN, STUDY = "run", "study"
 ORDERS = {"task": "navigation", "prior": {"kind": "esp", "transforms": "d4*agents-1-0-2,landmarks-1-0-2"}}
 SPACE = b"mappo.num_epochs = [5, 10]\n[mappo.learning_rate]\nlow = 1e-4\nhigh = 0.01\nlog = true\n"
-TUNING = tuning(priors=("none",), budget=2, steps=300)
 
 
 @dataclass(frozen=True)
@@ -171,7 +166,6 @@ def _make_sound_files(scratch: Path) -> None:
     recorded = collect(make("navigation", 64, [0]), 64, 2)
     arrays = {name: getattr(recorded, name).numpy() for name in ("obs", "action", "reward", "next_obs")}
     np.savez(scratch / "transitions.npz", **arrays)
-    search(scratch / "tuning", TUNING)
     many = {"task.num_agents": 12, "task.sees": 3, "task.density": 8.0, "network.name": "set", "network.width": 8}
     crowd = tiny_folder(scratch / "crowd", steps=100, **{name.replace(".", "__"): x for name, x in many.items()})
     with crowd.lock():
@@ -294,15 +288,6 @@ def _results(path: Path) -> None:
     read_results(path)
 
 
-def _tuning(path: Path) -> str | None:
-    return _document(TUNING_FORMAT, path, TUNING_FORMAT.parse(path, Tuning).model_dump(mode="json"))
-
-
-def _journal(path: Path) -> None:
-    found = Search.create(path.parent, TUNING)
-    budget_table(found.tuning, [found.outcome("none")])
-
-
 def _format(name: str) -> str:
     return "esp-checkpoint" if name == "checkpoint" else "esp-policy"
 
@@ -317,8 +302,6 @@ _ALL = (
     ("evaluation/final-evaluation.json", _evaluation, "report {scratch}/study", spoil_json),
     (f"bundled/{MANIFEST}", _manifest, "policies", spoil_json),
     ("transitions.npz", _transitions, "discover {scratch}/transitions.npz --task navigation", spoil_bytes),
-    ("tuning/journal.jsonl", _journal, "report {scratch}/tuning", spoil_json),
-    ("tuning/tuning.json", _tuning, "report {scratch}/tuning", spoil_json),
     ("crowd/policy.safetensors", _policy, "eval {scratch}/crowd -e 2", spoil_header),
     ("orders.json", _orders, "train --config {scratch}/orders.json --print-config", spoil_json),
     ("space.toml", _space, "tune --space {scratch}/space.toml --out {scratch}/never --budget 1 --dry-run", spoil_bytes),
@@ -333,8 +316,6 @@ _NAMES = (
     "evaluation",
     "manifest",
     "transitions",
-    "journal",
-    "tuning",
     "crowd",
     "orders",
     "space",

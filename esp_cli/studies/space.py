@@ -1,10 +1,10 @@
-"""What tuning searches: a range or a list of values for each setting, by default one space for each algorithm."""
+"""What a search tries: a range or a list of values for each setting, by default one space for each algorithm."""
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Mapping
+import random
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from pydantic import JsonValue, field_validator, model_validator
@@ -55,82 +55,79 @@ class Dimension(Strict):
         between = () if self.is_whole else (self.low + (self.high - self.low) / math.e,)
         return (self.low, *between, self.high)
 
-    def encoded(self, value: JsonValue) -> object:
-        """Return a value as a trial of Optuna holds it; None where it is outside of the space."""
+    def draw(self, generator: random.Random) -> JsonValue:
+        """Draw a value, each equally likely; of a logarithmic range, each order of magnitude."""
         if self.choices is not None:
-            return next((json.dumps(choice) for choice in self.choices if choice == value), None)
-        if not isinstance(value, int | float) or self.low is None or self.high is None:
-            return None
-        fits = value % 1 == 0 or not self.is_whole
-        return value if fits and self.low <= value <= self.high else None
-
-    def holding(self, value: JsonValue) -> Dimension:
-        """Return this dimension, or one that is as much wider as it takes to hold a value of its kind."""
-        if value is None or self.encoded(value) is not None:
-            return self
-        if self.choices is not None:
-            return Dimension(choices=(value, *self.choices))
-        if not isinstance(value, int | float) or self.low is None or self.high is None or (self.log and value <= 0):
-            return self
-        return Dimension(low=min(self.low, value), high=max(self.high, value), log=self.log)
+            return generator.choice(self.choices)
+        assert self.low is not None
+        assert self.high is not None
+        if isinstance(self.low, int) and isinstance(self.high, int) and not self.log:
+            return generator.randint(self.low, self.high)
+        if not self.log:
+            return generator.uniform(self.low, self.high)
+        drawn = math.exp(generator.uniform(math.log(self.low), math.log(self.high)))
+        return round(drawn) if self.is_whole else min(max(drawn, self.low), self.high)  # whatever exp rounds to
 
 
 Space = Mapping[str, Dimension]  # dotted names of settings -> what is tried of each
 
 
-def _range(low: float, high: float, log: bool = True) -> Dimension:
-    return Dimension(low=low, high=high, log=log)
+def of(**values: Sequence[JsonValue]) -> Space:
+    """Return a space of choices."""
+    return {name: Dimension(choices=tuple(choices)) for name, choices in values.items()}
 
 
-def _choices(*values: JsonValue) -> Dimension:
-    return Dimension(choices=values)
-
-
-_NETWORK = {"network.hidden": _choices([64, 64], [128, 128]), "network.activation": _choices("tanh", "relu")}
-_PRIOR = {"prior.consistency_coef": _range(0.01, 1.0)}
-_GAMMA = _range(0.9, 0.995, log=False)
-_OFF_POLICY = {
-    "learning_rate": _range(5e-4, 1e-2),
-    "gamma": _GAMMA,
-    "td_lambda": _range(0.0, 0.95, log=False),
-    "updates_per_episode": _choices(1, 2),
-    "num_envs": _choices(4, 8),
-    "epsilon_steps": _range(5_000, 200_000),
-}
-SPACES: Mapping[str, Space] = {
-    "mappo": {
-        "mappo.learning_rate": _range(1e-4, 1e-2),
-        "mappo.entropy_coef": _range(1e-3, 0.1),
-        "mappo.gamma": _GAMMA,
-        "mappo.gae_lambda": _range(0.8, 0.99, log=False),
-        "mappo.clip_epsilon": _range(0.1, 0.3, log=False),
-        "mappo.num_epochs": _range(3, 15, log=False),
-        "mappo.num_minibatches": _choices(1, 2, 5, 10),
-        "mappo.num_envs": _choices(32, 64, 128),
-        **_NETWORK,
-    },
+_OFF_POLICY = of(
+    learning_rate=(1e-3, 2e-3, 4e-3, 1e-2),
+    gamma=(0.9, 0.95, 0.98, 0.99),
+    td_lambda=(0.3, 0.6, 0.8, 0.9),
+    updates_per_episode=(1, 2),
+    num_envs=(4, 8),
+    epsilon_steps=(5_000, 10_000, 20_000, 50_000),
+)
+LEARNERS: Mapping[str, Space] = {
+    "mappo": of(
+        learning_rate=(1e-3, 2e-3, 4e-3, 8e-3),
+        entropy_coef=(0.001, 0.003, 0.01, 0.03),
+        gamma=(0.9, 0.95, 0.98, 0.99),
+        gae_lambda=(0.8, 0.9, 0.95),
+        num_epochs=(3, 5, 8),
+        num_minibatches=(2, 5, 10),
+        num_envs=(64, 128),
+    ),
     "maddpg": {
-        **{f"maddpg.{name}": dimension for name, dimension in _OFF_POLICY.items()},
-        "maddpg.actor_learning_rate": _range(5e-4, 1e-2),
-        "maddpg.tau": _range(1e-3, 5e-2),
-        "maddpg.output_penalty": _range(1e-4, 0.1),
-        **_NETWORK,
+        **_OFF_POLICY,
+        **of(
+            actor_learning_rate=(1e-3, 2e-3, 4e-3, 1e-2),
+            tau=(0.005, 0.01, 0.03),
+            output_penalty=(1e-4, 1e-3, 1e-2),
+        ),
     },
-    "qmix": {
-        **{f"qmix.{name}": dimension for name, dimension in _OFF_POLICY.items()},
-        "qmix.target_every": _range(25, 400),
-        "qmix.replay_episodes": _choices(500, 1000, 5000),
-        **_NETWORK,
-    },
+    "qmix": {**_OFF_POLICY, **of(target_every=(25, 50, 100, 200), replay_episodes=(500, 1000, 5000))},
 }
-"""Unless the user names another one. The prior adds the weight of its loss."""
+"""What is tried of each learner's settings."""
+_PRIOR: Space = {"prior.consistency_coef": Dimension(choices=(0.03, 0.1, 0.3, 1.0))}
+_NETWORK: Space = {
+    "network.hidden": Dimension(choices=([64, 64], [128, 128])),
+    "network.activation": Dimension(choices=("tanh", "relu")),
+}
+
+
+def of_learner(algorithm: str) -> Space:
+    """Return what is tried of a learner's settings, and of the prior's."""
+    if algorithm not in LEARNERS:
+        raise UserError(f"{algorithm} has no default space; name the settings to tune with --space FILE")
+    return {**{f"{algorithm}.{name}": tried for name, tried in LEARNERS[algorithm].items()}, **_PRIOR}
 
 
 def default_space(algorithm: str) -> Space:
-    """Return the space of an algorithm; settings of the prior concern runs with the prior alone."""
-    if algorithm not in SPACES:
-        raise UserError(f"{algorithm} has no default space; name the settings to tune with --space FILE")
-    return {**SPACES[algorithm], **_PRIOR}
+    """Return what is tried where the user names nothing else: the learner's settings, the prior's and the network's."""
+    return {**of_learner(algorithm), **_NETWORK}
+
+
+def drawn(space: Space, generator: random.Random) -> dict[str, JsonValue]:
+    """Draw a value of each setting."""
+    return {name: dimension.draw(generator) for name, dimension in space.items()}
 
 
 def read_space(path: Path) -> Space:
