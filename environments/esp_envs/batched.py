@@ -168,6 +168,10 @@ class BatchedTask(Environment):
             if found is None or tuple(found.shape) != expected:
                 got = "is missing" if found is None else f"has shape {tuple(found.shape[1:])}"
                 raise UserError(f"'{field.name}' {got} in what '_start' of {self.spec.name} drew; give {expected[1:]}")
+            if found.dtype != torch.float32:  # as states are, which worlds are put back into
+                raise UserError(
+                    f"'{field.name}' of what '_start' of {self.spec.name} drew is {found.dtype}; give torch.float32"
+                )
         self.world = drawn
         self._further = tuple(drawn.keys() - {field.name for field in self.spec.state.fields})
 

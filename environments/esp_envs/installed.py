@@ -121,7 +121,7 @@ def import_named(name: str, noun: str, kind: str, example: str) -> Any:
     try:
         module = import_module(module_name)
     except (Exception, SystemExit) as error:
-        missing = isinstance(error, ModuleNotFoundError) and module_name.startswith(error.name or "?")
+        missing = isinstance(error, ModuleNotFoundError) and f"{module_name}.".startswith(f"{error.name}.")
         place = f"; it is looked for in {here} and among installed packages, without .py" if missing else ""
         raise UserError(f"cannot import the module '{module_name}' of the {noun}: {last_line(error)}{place}") from error
     finally:

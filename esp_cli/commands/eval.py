@@ -88,6 +88,8 @@ def _print(result: FinalEvaluation, policy: str) -> None:
         else "over seeds, of reference policies over episodes"
     )
     caption = f"convention {result.convention}; mean ± s.e.m. and 95 % interval {over}"
+    if 1 < len(result.seeds) < 5:
+        caption += "; so few seeds make it too narrow"
     if result.heuristics:
         caption += "; normalised: 0 random, 1 the best heuristic"
     console.table(("policy", "episode return>", "95 % interval>", "normalised>"), rows, title=title, caption=caption)

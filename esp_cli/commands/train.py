@@ -101,6 +101,7 @@ def train(
 
     from esp_cli import run as runs
     from esp_cli.commands.train_choices import plan_run
+    from esp_cli.machine import resolve_device
     from esp_cli.training.config import is_prior_chosen
     from esp_cli.training.run_folder import RUN_FORMAT
     from esp_cli.training.trackers import require
@@ -110,7 +111,10 @@ def train(
     if resume is not None:
         own = {"task": task, "algo": algo, "network": network or ""}
         _refuse_beside_resume(context, allowed=[name for name, value in own.items() if ":" in value])
-        _train(runs.Run(resume), trackers, watch, not no_check)
+        run = runs.Run(resume)
+        if options.was_given(context, "device"):
+            run.config = run.config.model_copy(update={"device": resolve_device(device)})
+        _train(run, trackers, watch, not no_check)
         return
     require(trackers)
     if prior == "none" and transforms is not None:
@@ -141,7 +145,7 @@ def _refuse_beside_resume(context: typer.Context, allowed: Sequence[str]) -> Non
     given = [
         parameter.opts[0]
         for parameter in context.command.params
-        if parameter.name not in ("resume", "track", "watch", "no_check", *allowed)
+        if parameter.name not in ("resume", "track", "watch", "no_check", "device", *allowed)
         and options.was_given(context, parameter.name)
     ]
     if given:

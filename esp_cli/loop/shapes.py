@@ -113,7 +113,8 @@ def carry(spaces: Spaces, move: Callable[[Tensor], Tensor], x: Tensor, lead: tor
     if x.shape in (agents, (*agents, 1)):
         return move(x.reshape(agents)).reshape(x.shape)
     reason = f"; {HIDDEN}" if x.shape[: len(agents)] == agents else ""
-    raise UserError(f"{name} has shape {list(x.shape)}, but {list(agents)} or {list(lead)} is needed{reason}")
+    needed = " or ".join(dict.fromkeys(str(list(shape)) for shape in (agents, lead)))
+    raise UserError(f"{name} has shape {list(x.shape)}, but {needed} is needed{reason}")
 
 
 def carry_along(spaces: Spaces, transform: Transform, x: Tensor, lead: torch.Size, name: str) -> Tensor:

@@ -68,7 +68,7 @@ class TrainedPolicy:
             further = _FURTHER if config.network.free_of_counts else ()
             return replace(found, further={name: t for name, t in tensors.items() if name.startswith(further)})
         if folder.policy_path.is_file():  # somebody may have removed its checkpoints
-            return _build(path, config, *load_checkpoint(folder.policy_path, POLICY_FORMAT))
+            return _build(path, config, *load_checkpoint(folder.policy_path, POLICY_FORMAT), tuple(notes))
         raise UserError(f"{path} holds no checkpoint yet; train on with esp train --resume {quote(str(path))}")
 
     def transfer(self, settings: Mapping[str, object]) -> TrainedPolicy:

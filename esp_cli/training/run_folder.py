@@ -159,8 +159,9 @@ class RunFolder:
     def latest_checkpoint(self, note: Callable[[str], object]) -> tuple[dict[str, Tensor], dict[str, Any]] | None:
         """Return the newest good checkpoint; `note` is told, in a sentence, of a damaged one that is passed over.
 
-        It is tensors, on the CPU, and a description, with ``step``; None where the run has written none yet. Where all
-        are damaged, or the newest good one is of another run or configuration, that is an error.
+        It is tensors, on the CPU, and a description, with ``step``. None where the run has written none yet, or where
+        all are damaged but its policy file is there; without that, or where the newest good one is of another run or
+        configuration, that is an error.
         """
         problem = None
         for file in reversed(self.checkpoints()):
@@ -176,8 +177,10 @@ class RunFolder:
             if problem:
                 note(f"{problem}; going back to step {step_of(file)}")
             return tensors, {key: value for key, value in meta.items() if key not in (RUN_ID, CONFIG_SHA256)}
-        if problem:
+        if problem and not self.policy_path.is_file():
             raise RunFolderError(f"{self.path} has no good checkpoint ({problem}); train anew under another --out")
+        if problem:
+            note(f"{problem}; taking {self.policy_path}")
         return None
 
     def task_version(self) -> int | None:

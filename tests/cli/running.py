@@ -100,6 +100,7 @@ def _without_checkpoints(run: Path) -> Path:
 def _with_truncated_checkpoints(run: Path) -> Path:
     for file in (run / "checkpoints").iterdir():
         _truncate(file)
+    (run / "policy.safetensors").unlink()
     return run
 
 

@@ -159,3 +159,11 @@ def test_fewer_episodes_are_played_where_they_are_long_or_of_many_agents_and_the
     asked = esp("eval", finished, "--episodes", 6)
     assert "6 episodes" in asked.stdout
     assert "each, not" not in asked.stderr
+
+
+def test_a_policy_is_taken_where_its_last_checkpoint_is_damaged(copied: Path) -> None:
+    for file in (copied / "checkpoints").iterdir():
+        file.write_bytes(file.read_bytes()[:-5])
+    told = esp("eval", copied, "--episodes", 2)
+    assert f"taking {copied / 'policy.safetensors'}" in " ".join(told.stderr.split())
+    assert "too narrow" in " ".join(told.stdout.split())

@@ -230,7 +230,7 @@ def test_a_second_interrupt_stops_at_once(tmp_path: Path, monkeypatch: pytest.Mo
         (["--task", "navigation", "--prior", "none"], "--task, --prior"),
         (["-a", "mappo", "--preset", "paper", "--transforms", "c4"], "--algo, --preset, --transforms"),
         (["--network", "gru", "--transforms", "c4"], "--transforms, --network"),
-        (["--device", "cpu", "--set", "mappo.gamma=0.9"], "--device, --set"),
+        (["--device", "cpu", "--set", "mappo.gamma=0.9"], "--set"),
     ],
 )
 def test_options_that_a_resumed_run_would_ignore_are_refused(copied: Path, options: list[str], named: str) -> None:
@@ -323,3 +323,11 @@ def test_a_page_that_cannot_be_drawn_is_told_once_and_stops_no_run(tmp_path, mon
     said = esp("train", "--steps", 100, *TINY_OPTIONS, "--out", tmp_path / "run", "--watch").stderr
     assert said.count("tracking with --watch ended: it cannot write (no room for pixels); the run goes on") == 1
     assert (tmp_path / "run" / "policy.safetensors").is_file()
+
+
+def test_a_run_of_a_gpu_goes_on_without_one(copied: Path) -> None:
+    edit_config(copied, device="cuda")
+    (copied / "policy.safetensors").unlink()
+    assert "there is no CUDA device here" in refused("train", "--resume", copied)
+    assert "resuming at 150" in esp("train", "--resume", copied, "--device", "cpu").stderr
+    assert config_of(copied)["device"] == "cuda", "what it was begun on"

@@ -160,6 +160,7 @@ def test_actions_arrive_within_their_bounds() -> None:
         ),
         ("_allow", torch.ones(2, 5, 2, 5), "'_allow' is torch.float32, expected torch.bool"),
         ("_ended", torch.ones(2, dtype=torch.bool), r"'_ended' has shape \(2,\), expected \(2, 5\)"),
+        ("_start", {"position": torch.zeros(5, 2, 2, dtype=torch.int64)}, "_start' of plain drew is torch.int64; give"),
         ("_start", {"position": torch.zeros(5, 2)}, r"'position' has shape \(5, 2\) in what '_start' of plain drew"),
         (
             "_observe",

@@ -4,6 +4,7 @@ import re
 import sys
 import time
 import types
+from itertools import count
 
 import numpy as np
 import pytest
@@ -12,7 +13,19 @@ import torch
 from esp_cli import train
 from esp_cli.training.build import first_look
 from esp_cli.training.config import resolve_config
-from esp_envs import Continuous, Discrete, Environment, Field, Kind, UserError, generators_for, layout, register
+from esp_envs import (
+    Continuous,
+    Discrete,
+    Environment,
+    Field,
+    Kind,
+    UserError,
+    generators_for,
+    installed,
+    layout,
+    make,
+    register,
+)
 from esp_envs.adapters.gymnasium import SingleAgentSettings, SingleAgentTask
 from esp_envs.adapters.pettingzoo import ParallelSettings, ParallelTask
 from esp_envs.conformance import Subject, check
@@ -374,7 +387,10 @@ NAMED = {
     "numpy's generator": (task(at(1, lambda s, o: o[REWARD].update(b=np.random.rand()))), "two runs of one seed"),  # noqa: NPY002
     "torch's generator": (task(at(1, lambda s, o: o[REWARD].update(b=float(torch.rand(()))))), "two runs of one seed"),
     "the clock": (task(at(1, lambda s, o: o[REWARD].update(b=time.perf_counter_ns() % 1e6))), "two runs of one seed"),
-    "the seed is ignored": (task(of={"reset": lambda self, seed=None: Team.reset(self, 1)}), "another seed gives"),
+    "the seed is ignored": (
+        task(of={"reset": lambda self, seed=None: Team.reset(self, next(vars(self).setdefault("calls", count())))}),
+        "another seed gives",
+    ),
     "deaf": (task(of={"step": lambda self, a: Team.step(self, dict.fromkeys(a, 0))}), "actions change nothing"),
 }  # fmt: skip
 
@@ -510,3 +526,27 @@ def test_a_training_begins_with_a_note_of_what_is_broken(name, sentence, tmp_pat
         assert re.search(expected, note)
         assert "esp check task" in note
     assert first_look(resolve_config("navigation", "mappo", steps=8)) == []
+
+
+def test_what_one_start_or_one_step_cannot_show_is_not_asked():
+    always = task(of={"reset": lambda self, seed=None: Team.reset(self, 1)})
+    for make_one, reason in (
+        (lambda n, seeds: worlds(always, n, seeds), "every episode starts alike"),
+        (lambda n, seeds: make("navigation", n, seeds, {"horizon": 1}), "an episode is one step"),
+    ):
+        found = list(check(Subject(make_one)))
+        assert [finding.broken for finding in found if finding.broken] == []
+        assert reason in {finding.not_asked for finding in found}
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_what_raises_in_the_users_code_is_named_with_its_line(monkeypatch, workers):
+    def opponent(self, name, seen, rng):
+        return {}["x"]
+
+    monkeypatch.setattr(installed, "_FOREIGN", {__name__.partition(".")[0]})
+    cls = task(learners="a", opponent=opponent)
+    env = cls(TeamSettings(workers=workers), 1, generators_for((3,)))
+    env.reset()
+    with pytest.raises(UserError, match=r"in 'opponent': KeyError: 'x', in 'opponent' \(test_hostile_zoo.py, line \d+"):
+        env.step(env.random_action())

@@ -258,6 +258,24 @@ def drifting(**members):
     return env.step(env.random_action())
 
 
+def test_a_scenario_that_is_given_as_an_object_is_each_simulators_own() -> None:
+    class Scattered(Drift):
+        def reset_world_at(self, env_index=None):
+            for agent in self.world.agents:
+                agent.set_pos(torch.rand((3, 2) if env_index is None else (1, 2)), batch_index=env_index)
+
+    class Drifting(VmasTask):
+        scenario, symmetry, convention = Scattered(), "agents", "none"
+
+        def seen(self):
+            return layout(Field("position", Kind.VECTOR), Field("velocity", Kind.VECTOR))
+
+    env, _ = (Drifting(Drifting.Settings(), 3, generators_for((0, 1))) for _ in range(2))
+    env.reset()
+    step = env.step(env.random_action())
+    assert torch.allclose(step.reward, -step.next.obs[..., :2].norm(dim=-1), atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("members", "sentence"),
     [

@@ -117,6 +117,9 @@ def test_the_rank_sum_test_by_hand():
     # of the 20 ways to choose three ranks of six, one has all the highest and one all the lowest
     assert rank_sum_p([4.0, 5.0, 6.0], [1.0, 2.0, 3.0]) == pytest.approx(2 / 20)
     assert rank_sum_p([1.0, 4.0], [2.0, 3.0]) == pytest.approx(1.0)
+    # ties, as of successes of 0 or 1: still 2 of 20; of 70, the three ways below and their mirrors are as far apart
+    assert rank_sum_p([1.0] * 3, [0.0] * 3) == pytest.approx(2 / 20)
+    assert rank_sum_p([1.0, 1.0, 2.0, 2.0], [2.0, 3.0, 3.0, 3.0]) == pytest.approx(6 / 70)
 
 
 def test_steps_to_threshold_by_hand():

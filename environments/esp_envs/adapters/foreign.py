@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from esp_envs.errors import UserError
-from esp_envs.installed import last_line
+from esp_envs.installed import last_line, raised_in
 from esp_envs.spec import Continuous, Kind
 
 PARALLEL, SINGLE = "a PettingZoo ParallelEnv", "a Gymnasium environment"
@@ -110,7 +110,8 @@ def reset(env: Any, seed: int) -> Any:
     try:
         return env.reset(seed=seed)
     except TypeError as error:
-        if "unexpected keyword argument 'seed'" not in str(error):
+        inside = error.__traceback__ is not None and error.__traceback__.tb_next is not None
+        if inside or "unexpected keyword argument 'seed'" not in str(error):
             raise
         raise UserError("'reset' takes no seed; define reset(self, seed=None, options=None)") from error
 
@@ -181,7 +182,8 @@ def naming(place: str, what: str) -> Iterator[None]:
     except UserError:
         raise
     except (Exception, SystemExit) as error:  # an environment that calls sys.exit ends no run with code 0
-        raise UserError(f"{place} raises in '{what}': {last_line(error)}") from error
+        line = f", in {found}" if (found := raised_in(error)) else ""
+        raise UserError(f"{place} raises in '{what}': {last_line(error)}{line}") from error
 
 
 def require_round(action: Continuous, symmetry: str, name: Any, box: tuple[NDArray[Any], NDArray[Any]]) -> None:

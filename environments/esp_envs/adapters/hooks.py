@@ -48,6 +48,8 @@ class CopyHooks(ABC):
     """Whether all agents, or those of a role, get the same reward."""
     metrics: tuple[str, ...] = ()
     """Names of the numbers that `measure` returns; by default it takes them from the agents' infos."""
+    totals: tuple[str, ...] = ()
+    """Those of them that are added up over an episode, as successes are; the mean is taken of the others."""
 
     simulated: Layout | None = None
     """What `take` returns, so that checks can pair states; known of MPE's particles, and where agents see all of it."""

@@ -112,6 +112,7 @@ class ParallelTask(CopyHooks, Environment):
             state=self.state,
             terminates=self.terminates,
             agents_end=self.agents_end,
+            totals=self.totals,
             settings=self.settings.model_dump(),
         )
 

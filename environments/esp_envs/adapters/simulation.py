@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from copy import deepcopy
 from typing import Any
 
 import torch
@@ -24,7 +25,8 @@ def simulator(scenario: Any, num_envs: int, device: torch.device, arguments: Map
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("error", message="Scenario kwargs")  # VMAS warns of what it does not know
-            return vmas.make_env(scenario, num_envs, device=device, seed=0, **arguments)
+            own = scenario if isinstance(scenario, str) else deepcopy(scenario)  # a scenario holds its worlds
+            return vmas.make_env(own, num_envs, device=device, seed=0, **arguments)
     except UserWarning as unknown:
         told = str(unknown).partition(" passed")[0].removeprefix("Scenario kwargs: ")
         raise UserError(

@@ -76,7 +76,8 @@ class CopyStepper:
         with copy.naming("acting", k):
             chosen = {name: task.acting(name, action) for name, action in native.items()}
         acting, others = list(chosen), [name for name in copy.rest if name in living]
-        chosen |= {name: task.opponent(name, seen[name], self._opponents_draws[k]) for name in others}
+        with copy.naming("opponent", k):
+            chosen |= {name: task.opponent(name, seen[name], self._opponents_draws[k]) for name in others}
         with copy.naming("step", k):
             seen, reward, *flags, infos = foreign.parts(copy.env.step(chosen), "step")
             ended, cut = foreign.ends(copy.env, copy.agents, *flags)
