@@ -6,6 +6,7 @@ import math
 import random
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 from pydantic import JsonValue, field_validator, model_validator
 
@@ -68,6 +69,8 @@ class Dimension(Strict):
         drawn = math.exp(generator.uniform(math.log(self.low), math.log(self.high)))
         return round(drawn) if self.is_whole else min(max(drawn, self.low), self.high)  # whatever exp rounds to
 
+
+_Value = TypeVar("_Value")
 
 Space = Mapping[str, Dimension]  # dotted names of settings -> what is tried of each
 
@@ -153,7 +156,7 @@ def read_space(path: Path) -> Space:
     return {name: validated(Dimension, values, name) for name, values in fields.items()}
 
 
-def space_of(space: Space, prior: str) -> Space:
-    """Return what changes anything in runs with this kind of prior: without it, nothing of the prior does."""
+def of_use(settings: Mapping[str, _Value], prior: str) -> dict[str, _Value]:
+    """Return the settings that change anything in runs with this kind of prior; without it, none of the prior does."""
     idle = {f"prior.{name}" for name in of_no_use_to(prior)}
-    return {name: d for name, d in space.items() if name not in idle}
+    return {name: value for name, value in settings.items() if name not in idle}

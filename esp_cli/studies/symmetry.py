@@ -11,12 +11,11 @@ from dataclasses import dataclass, field, replace
 
 from esp_cli.checking.measured import planned
 from esp_cli.files.formatting import file_name, format_exactly
-from esp_cli.prior.config import of_no_use_to
 from esp_cli.studies.catalogue import Request, refuse_other_tasks, refuse_unknown_or_twice, refuse_varied, settings_of
 from esp_cli.studies.kinds import KINDS, Settings
 from esp_cli.studies.plan import Cell
 from esp_cli.studies.search import FIRST_TRIAL_SEED, Candidate, Search
-from esp_cli.studies.space import LEARNERS, Dimension, drawn, of_learner
+from esp_cli.studies.space import LEARNERS, Dimension, drawn, of_learner, of_use
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config
 from esp_envs.errors import UserError
@@ -162,12 +161,11 @@ class Benchmark(Search):
         networks = dict(zip((PERCEPTRON, HOMOMORPHIC), board.networks, strict=True))
         of_method, given = (settings_of(some, board.task, algorithm) for some in (METHODS[method], request.overrides))
         own = {key: networks.get(str(value), value) for key, value in of_method.items()}
-        idle = {f"prior.{key}" for key in of_no_use_to(str(own["prior.kind"]))}
-        idle |= (_OF_NETWORKS.keys() - own.keys()) | given.keys()
+        idle = (_OF_NETWORKS.keys() - own.keys()) | given.keys()
         idle |= set() if board.batches else {f"{algorithm}.{key}" for key in _OF_BATCHES}
-        drawn = {key: value for key, value in self.draws[draw].items() if key not in idle}
+        tried = {key: value for key, value in self.draws[draw].items() if key not in idle}
         steps, seeds = self.steps(name, trial), self.trial_seeds if trial else request.seeds
-        settings = {**board.settings, **own, **drawn, **given}
+        settings = {**board.settings, **own, **of_use(tried, str(own["prior.kind"])), **given}
         return planned(resolve_config(board.task, algorithm, preset, steps, seeds, request.device, settings))
 
     def _cell(self, name: str, method: str, draw: int, trial: bool) -> Cell:

@@ -15,7 +15,7 @@ from esp_cli.files.writing import replace_file
 from esp_cli.studies.catalogue import Request, refuse_other_tasks, refuse_unknown_or_twice, task_setting
 from esp_cli.studies.plan import Cell, Study
 from esp_cli.studies.search import FIRST_TRIAL_SEED, Candidate, Search, Trials
-from esp_cli.studies.space import Space, default_space, drawn, read_space, space_of
+from esp_cli.studies.space import Space, default_space, drawn, of_use, read_space
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config
 from esp_envs.errors import UserError
@@ -63,8 +63,7 @@ class Tuning(Search):
 
     def _asked(self, prior: str, settings: Mapping[str, object], seeds: Sequence[int]) -> RunConfig:
         """Return a run before anything is measured for it; without a prior, none of its settings counts."""
-        own = {name: value for name, value in settings.items() if name in space_of(self.space, prior)}
-        chosen = {**self.overrides, "prior.kind": prior, **own}
+        chosen = {**self.overrides, "prior.kind": prior, **of_use(settings, prior)}
         request = self.request
         return resolve_config(self.task, self.algorithm, request.preset, self.steps, seeds, request.device, chosen)
 
@@ -72,14 +71,14 @@ class Tuning(Search):
         """Return the space of a file, or of the default one what a run has."""
         if file is not None:
             return {task_setting(name, self.task): tried for name, tried in read_space(file).items()}
-        self.space = default_space(self.algorithm)
+        default = default_space(self.algorithm)
         stored = self._asked(self.priors[0], {}, self.trial_seeds).model_dump(mode="json")
         known = {**stored["algorithm_settings"], **stored["network"], **stored["prior"]}
-        return {name: tried for name, tried in self.space.items() if known.get(name.rpartition(".")[2]) is not None}
+        return {name: tried for name, tried in default.items() if known.get(name.rpartition(".")[2]) is not None}
 
     def without_effect(self, prior: str) -> frozenset[str]:
         """Return the settings that change nothing with a prior, at the defaults and at each value that is checked."""
-        space = space_of(self.space, prior)
+        space = of_use(self.space, prior)
         tried: list[dict[str, object]] = [{name: value} for name, d in space.items() for value in d.corners()]
         configs = (self._asked(prior, settings, self.trial_seeds) for settings in ({}, *tried))
         return frozenset.intersection(*(config.without_effect() for config in configs))
@@ -91,7 +90,7 @@ class Tuning(Search):
             raise UserError("a tuning takes the kinds of prior by --prior, not by --set or --space")
         effective, searched = set[str](), set[str]()
         for prior in self.priors:
-            space = space_of(self.space, prior)
+            space = of_use(self.space, prior)
             if not space:
                 raise UserError(
                     f"with --prior {prior} no setting of the space changes anything, so its trials would be equal; add "
@@ -174,7 +173,7 @@ class Tuning(Search):
         study, best = super().judged(trials), self.best(trials)
         for prior in self.priors:
             if (number := best.get((self.task, NAMES[prior]))) is not None:
-                own = {name: self.draws[number][name] for name in space_of(self.space, prior) if number}
+                own = of_use(self.draws[number], prior)
                 whole = {"task": self.task, "algorithm": self.algorithm, "preset": self.request.preset}
                 document = {**whole, "steps": self.steps, **self.overrides, "prior.kind": prior, **own}
                 text = json.dumps(document, indent=2) + "\n"
