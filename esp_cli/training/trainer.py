@@ -224,6 +224,8 @@ class Trainer:
             self.learner.start_from(read_initial(self.folder.initial_path, self.config.init_from))
         if found is None and check:
             self.notes += first_look(self.config)
+        if found and not self.folder.metrics_path.exists():
+            self.notes.append(f"{self.folder.metrics_path} is gone; curves of this run begin at step {self.step}")
         truncate_metrics(self.folder.metrics_path, self.step if found else -1)
 
     def _stand(self, meta: Mapping[str, Any]) -> None:

@@ -84,6 +84,15 @@ def test_metrics_past_the_checkpoint_are_dropped_on_resume(tmp_path):
     assert resumed.step == kept[-1]["step"]
 
 
+def test_a_run_whose_metrics_are_gone_says_so(tmp_path):
+    halted = tiny_folder(tmp_path / "halted")
+    assert not trainer(halted).run(stop_after(2))
+    assert trainer(halted).notes == []
+    halted.metrics_path.unlink()
+    resumed = trainer(halted)
+    assert resumed.notes == [f"{halted.metrics_path} is gone; curves of this run begin at step {resumed.step}"]
+
+
 def test_every_step_is_evaluated_in_worlds_of_its_own(tmp_path):
     """The policy stays as it began, so that the worlds alone make the returns differ."""
     folder = tiny_folder(tmp_path / "run", mappo__learning_rate=1e-30)
