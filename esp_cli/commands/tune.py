@@ -44,8 +44,7 @@ def tune(
     from esp_cli.studies.tuning import Tuning
 
     tuning = Tuning(choices.request(), parse_names(prior) or ("esp",), budget, trial_seeds, space)
-    idle = frozenset.intersection(*map(tuning.without_effect, tuning.priors))
-    note_without_effect([name for name in tuning.overrides if name in idle])
+    note_without_effect([name for name in tuning.overrides if name in tuning.idle])
     if tuning.refused:
         console.note(f"{len(tuning.refused)} draws do not go together and are left out, the first: {tuning.refused[0]}")
     if len(tuning.draws) < budget:

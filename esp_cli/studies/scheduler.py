@@ -113,8 +113,11 @@ class Scheduler:
     def _start(self, run: Run) -> None:
         try:
             self.folder.prepare(run.cell)
-            if self.folder.is_finished(run.cell) or self.folder.is_in_use(run.cell):
-                run.status = "finished" if self.folder.is_finished(run.cell) else "elsewhere"
+            if self.folder.is_finished(run.cell):
+                run.status = "finished"
+                return
+            if self.folder.is_in_use(run.cell):
+                run.status = "elsewhere"
                 return
             arguments = self.folder.next_command(run.cell)
             run.status = "training" if arguments[0] == "train" else "evaluating"

@@ -117,17 +117,18 @@ class Search(ABC):
         return self._judged(trials, _best(_scores(trials, ended)) | waiting)
 
     def judged(self, trials: Trials) -> Study:
-        """Plan the runs that judge, with each candidate's best trial, the first of equals; write down all scores."""
+        """Plan the runs that judge, with each candidate's best trial, the first of equals, and record the scores."""
         scores = _scores(trials, self.trials_of)
+        best = _best(scores)
+        self.record(trials.path, scores, best)
+        return self._judged(trials, best)
+
+    def record(self, path: Path, scores: Mapping[Candidate, Sequence[float]], best: Mapping[Candidate, int]) -> None:
+        """Write the draws and all scores into the folder of the search."""
         finite = {one: [value if math.isfinite(value) else None for value in own] for one, own in scores.items()}
         named = {": ".join(one): own for one, own in finite.items()}
         document = {"draws": self.draws, "seeds": self.trial_seeds, "scores": named}
-        replace_file(trials.path / "trials.json", (json.dumps(document, indent=1) + "\n").encode())
-        return self._judged(trials, _best(scores))
-
-    def best(self, trials: Trials) -> dict[Candidate, int]:
-        """Return the number of each candidate's best draw; one whose trials have no score is left out."""
-        return _best(_scores(trials, self.trials_of))
+        replace_file(path / "trials.json", (json.dumps(document, indent=1) + "\n").encode())
 
     def _judged(self, trials: Trials, best: Mapping[Candidate, int]) -> Study:
         if not best:

@@ -13,8 +13,8 @@ from esp_cli.checking.measured import planned
 from esp_cli.files.formatting import file_name, format_count
 from esp_cli.files.writing import replace_file
 from esp_cli.studies.catalogue import Request, refuse_other_tasks, refuse_unknown_or_twice, task_setting
-from esp_cli.studies.plan import Cell, Study
-from esp_cli.studies.search import FIRST_TRIAL_SEED, Candidate, Search, Trials
+from esp_cli.studies.plan import Cell
+from esp_cli.studies.search import FIRST_TRIAL_SEED, Candidate, Search
 from esp_cli.studies.space import Space, default_space, drawn, of_use, read_space
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config
@@ -30,6 +30,7 @@ class Tuning(Search):
 
     Attributes:
         refused: why draws were left out, one text each: their settings do not go together.
+        idle: settings that change nothing with any of the priors.
     """
 
     title = "Trials of a tuning"
@@ -76,7 +77,7 @@ class Tuning(Search):
         known = {**stored["algorithm_settings"], **stored["network"], **stored["prior"]}
         return {name: tried for name, tried in default.items() if known.get(name.rpartition(".")[2]) is not None}
 
-    def without_effect(self, prior: str) -> frozenset[str]:
+    def _without_effect(self, prior: str) -> frozenset[str]:
         """Return the settings that change nothing with a prior, at the defaults and at each value that is checked."""
         space = of_use(self.space, prior)
         tried: list[dict[str, object]] = [{name: value} for name, d in space.items() for value in d.corners()]
@@ -88,7 +89,7 @@ class Tuning(Search):
         self.refuse_trial_seeds()
         if "prior.kind" in self.overrides or "prior.kind" in self.space:
             raise UserError("a tuning takes the kinds of prior by --prior, not by --set or --space")
-        effective, searched = set[str](), set[str]()
+        effective, searched, idle = set[str](), set[str](), list[frozenset[str]]()
         for prior in self.priors:
             space = of_use(self.space, prior)
             if not space:
@@ -100,11 +101,13 @@ class Tuning(Search):
                 self._refuse_given(name)
                 for value in dimension.corners():
                     self._asked(prior, {name: value}, self.trial_seeds)
+            idle.append(self._without_effect(prior))
             searched |= space.keys()
-            effective |= space.keys() - self.without_effect(prior)
-        if idle := sorted(searched - effective):
+            effective |= space.keys() - idle[-1]
+        self.idle = frozenset.intersection(*idle)
+        if lost := sorted(searched - effective):
             raise UserError(
-                f"the space varies '{idle[0]}', which is without effect beside the other settings; leave it out"
+                f"the space varies '{lost[0]}', which is without effect beside the other settings; leave it out"
             )
 
     def _refuse_given(self, name: str) -> None:
@@ -168,14 +171,12 @@ class Tuning(Search):
                 plain = default, tuned
         return cells
 
-    def judged(self, trials: Trials) -> Study:
-        """Plan what judges, and write the best settings of each kind of prior for `esp train --config`."""
-        study, best = super().judged(trials), self.best(trials)
+    def record(self, path: Path, scores: Mapping[Candidate, Sequence[float]], best: Mapping[Candidate, int]) -> None:
+        """Write the best settings of each kind of prior, too, for `esp train --config`."""
+        super().record(path, scores, best)
         for prior in self.priors:
             if (number := best.get((self.task, NAMES[prior]))) is not None:
                 own = of_use(self.draws[number], prior)
                 whole = {"task": self.task, "algorithm": self.algorithm, "preset": self.request.preset}
                 document = {**whole, "steps": self.steps, **self.overrides, "prior.kind": prior, **own}
-                text = json.dumps(document, indent=2) + "\n"
-                replace_file(trials.path / f"preset-{prior}.json", text.encode())
-        return study
+                replace_file(path / f"preset-{prior}.json", (json.dumps(document, indent=2) + "\n").encode())

@@ -29,12 +29,6 @@ def tuning(priors=BOTH, budget=4, space=WHOLE, **choice) -> Tuning:
         return Tuning(Request(**(plain | choice)), priors, budget, 2, "a file" if space else None)
 
 
-def best(asked: Tuning, tmp_path, **scores: int) -> dict[tuple[str, str], int]:
-    """Return the best draws where the trials of each kind of prior with these numbers score higher than the others."""
-    ends = {f"{prior}-{number:03d}": 5.0 for prior, number in scores.items()}
-    return asked.best(write_trials(tmp_path / "s", asked, ends))
-
-
 @pytest.mark.parametrize("algorithm", ["mappo", "maddpg", "qmix"])
 def test_every_algorithm_has_a_space_of_settings_that_it_takes_and_a_run_has(algorithm):
     assert algorithm in ALGORITHMS
@@ -171,10 +165,10 @@ def test_what_a_prior_leaves_to_be_measured_is_measured_for_every_trial():
         assert prior.weights["rot180"] < 0.1
 
 
-def test_the_best_settings_are_judged_beside_the_default_ones_on_other_seeds(tmp_path):
+def test_the_best_settings_are_judged_beside_the_default_ones_on_other_seeds():
     asked = tuning()
     # trial 0 of the plain learner has the default settings, so that it is both
-    cells = plain, default, tuned = asked.fresh(best(asked, tmp_path, esp=3, none=0))
+    cells = plain, default, tuned = asked.fresh({("navigation", "ESP"): 3, ("navigation", "plain"): 0})
     assert [cell.variant for cell in cells] == ["plain, default", "ESP, default", "ESP, tuned (trial 3)"]
     assert {cell.config.seeds for cell in cells} == {(0, 1)}
     assert tuned.config.algorithm_settings["learning_rate"] == asked.draws[3]["mappo.learning_rate"]
@@ -185,7 +179,7 @@ def test_the_best_settings_are_judged_beside_the_default_ones_on_other_seeds(tmp
         tuning(seeds=(0, 101))
 
 
-def test_tuned_is_compared_with_tuned_and_default_with_default(tmp_path):
+def test_tuned_is_compared_with_tuned_and_default_with_default():
     def references(priors=BOTH, **numbers: int) -> dict[str, str | None]:
         asked = tuning(priors=priors)
         names = {"esp": ("navigation", "ESP"), "none": ("navigation", "plain")}
