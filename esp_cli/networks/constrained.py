@@ -11,9 +11,9 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from esp_cli.networks.contract import ActivationName, Generators, IoSpec, Memoryless, Network, NetworkConfig, WithVJP
+from esp_cli.networks.contract import ActivationName, Generators, IoSpec, Memoryless, Network, NetworkConfig
 from esp_cli.networks.layers import GAINS, SeedMLP, orthogonal
-from esp_cli.networks.perceptron import Shape, affine, perceptron, perceptron_with_vjp
+from esp_cli.networks.perceptron import Shape, affine, perceptron
 from esp_cli.symmetry import FiniteGroup
 from esp_cli.symmetry.maps import Block, block_width, intertwiners, regular
 from esp_envs.errors import UserError
@@ -176,23 +176,8 @@ class Equivariant(Memoryless):
         self._shape = Shape(config.activation, activate_output=False, precision=torch.float32)
 
     def forward(self, x: Tensor) -> Tensor:
-        return perceptron(self._shape, [x], self._plain())
-
-    def with_vjp(self, x: Tensor, shape: Sequence[int], truncation: int = 0, defer: bool = True) -> WithVJP:
-        plain = self._plain()
-        outputs, vjp = perceptron_with_vjp(self._shape, [x], plain)
-
-        def vjp_of_free(slope: Tensor) -> list[Tensor]:
-            made = zip(plain, vjp(slope.reshape(outputs.shape)), strict=True)
-            learned, by_learned = zip(*((x, by_x) for x, by_x in made if x.requires_grad), strict=True)
-            return [*torch.autograd.grad(learned, self._all_parameters, by_learned)]
-
-        return WithVJP(outputs.reshape(shape), vjp_of_free, self._all_parameters)
-
-    def _plain(self) -> list[Tensor]:
-        """Return weights and biases of the plain perceptron that this one is, in the order of `perceptron`."""
         layers: list[ConstrainedLinear] = [*self.layers]
-        return [made for layer in layers for made in (layer.weight(), layer.bias())]
+        return perceptron(self._shape, [x], [made for layer in layers for made in (layer.weight(), layer.bias())])
 
 
 class Gated(Memoryless):

@@ -46,38 +46,37 @@ def perceptron(shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tens
     return passed(partial(_pass, shape), inputs, parameters).unflatten(1, inputs[0].shape[1:-1])
 
 
-def passed(make: Callable[..., Any], inputs: Sequence[Tensor], parameters: Sequence[Tensor]) -> Tensor:
+def passed(make: Callable[..., Any], inputs: Sequence[Tensor], parameters: Sequence[Tensor]) -> Any:
     """Return the outputs of `make(inputs, parameters, keep)`, through which gradients flow where there is a graph.
 
-    What it makes has `outputs`, and where it is to `keep` what it needs for that `backward_to`; see `_Pass`.
+    What it makes has `outputs`, one tensor or several, and where it is to `keep` what it needs for that `backward_to`,
+    which takes the gradient by each; see `_Pass`.
     """
     if torch.is_grad_enabled():
         return _Passed.apply(make, len(inputs), *inputs, *parameters)  # type: ignore[no-untyped-call]
     return make(inputs, parameters, keep=False).outputs
 
 
-def perceptron_with_vjp(
-    shape: Shape, inputs: Sequence[Tensor], parameters: Sequence[Tensor]
-) -> tuple[Tensor, Callable[[Tensor], list[Tensor]]]:
-    """Return what `perceptron` does, without a graph, and its VJP; nothing may change in place before that is used."""
-    with torch.no_grad():
-        run = _pass(shape, inputs, parameters, keep=True)
-    return run.outputs.unflatten(1, inputs[0].shape[1:-1]), lambda slope: run.backward(slope.flatten(1, -2))
-
-
 class Deferred(WithVJP):
-    """What a compiled perceptron returns for rows, computed where somebody asks for it; see `learn`."""
+    """What a perceptron returns for rows, computed where somebody asks for it; where it `may_learn`, see `learn`.
 
-    def __init__(self, shape: Shape, rows: Tensor, parameters: Sequence[Tensor], size: Sequence[int]) -> None:
-        self._shape, self._rows, self.parameters, self.size = shape, rows, parameters, torch.Size(size)
+    Nothing may change in place before the VJP is used.
+    """
+
+    def __init__(
+        self, shape: Shape, rows: Tensor, parameters: Sequence[Tensor], size: Sequence[int], may_learn: bool
+    ) -> None:
+        self._shape, self._rows, self._may_learn = shape, rows, may_learn
+        self.parameters, self.size = parameters, torch.Size(size)
 
     @cached_property
-    def _run(self) -> CompiledPass:
-        return CompiledPass([self._rows], self.parameters, self._shape.activation, False)
+    @torch.no_grad()
+    def _run(self) -> _Pass | CompiledPass:
+        return _pass(self._shape, [self._rows], self.parameters, keep=True)
 
     @property
     def waits(self) -> bool:  # type: ignore[override]
-        return "_run" not in self.__dict__
+        return self._may_learn and "_run" not in self.__dict__
 
     @property
     def tensor(self) -> Tensor:  # type: ignore[override]

@@ -14,7 +14,7 @@ from esp_cli.networks.contract import ActivationName, Generators, IoSpec, Memory
 from esp_cli.networks.kernels.library import WORTH_COMPILING, computes, has_compiler
 from esp_cli.networks.layers import GAINS, SeedLayerNorm, SeedLinear, SeedMLP
 from esp_cli.networks.ordering import NearestFirst
-from esp_cli.networks.perceptron import Deferred, Shape, perceptron, perceptron_with_vjp
+from esp_cli.networks.perceptron import Deferred, Shape, perceptron
 from esp_cli.networks.recurrent import SeedGRU
 from esp_envs.errors import UserError
 
@@ -113,10 +113,8 @@ class MLP(SeedMLP, Memoryless):
     def with_vjp(self, x: Tensor, shape: Sequence[int], truncation: int = 0, defer: bool = True) -> WithVJP:
         if self.norms is not None:
             return super().with_vjp(x, shape, truncation)
-        if defer and computes(self.compiled, x):
-            return Deferred(self._shape(), x, self._all_parameters, shape)
-        outputs, vjp = perceptron_with_vjp(self._shape(), [x], self._all_parameters)
-        return WithVJP(outputs.reshape(shape), lambda slope: vjp(slope.reshape(outputs.shape)), self._all_parameters)
+        may_learn = defer and computes(self.compiled, x)
+        return Deferred(self._shape(), x, self._all_parameters, shape, may_learn)
 
 
 class GRU(Network):
