@@ -173,12 +173,14 @@ class _Passed(Function):
     def forward(ctx, make, num_inputs, *tensors):  # type: ignore[no-untyped-def]
         ctx.num_inputs, ctx.run = num_inputs, make(tensors[:num_inputs], tensors[num_inputs:], keep=True)
         ctx.save_for_backward(*tensors)  # so that autograd notices a change of them
-        return ctx.run.outputs.detach()  # the tensor itself would hold, by its grad_fn, what holds it
+        outputs = ctx.run.outputs  # which would hold, by their grad_fn, what holds them
+        return outputs.detach() if isinstance(outputs, Tensor) else tuple(x.detach() for x in outputs)
 
     @staticmethod
-    def backward(ctx, grad):  # type: ignore[no-untyped-def]
+    def backward(ctx, grad, *further):  # type: ignore[no-untyped-def]
         inputs, first = ctx.saved_tensors[: ctx.num_inputs], 2 + ctx.num_inputs
-        grads, below = ctx.run.backward_to(grad, ctx.needs_input_grad[first:], ctx.needs_input_grad[2:first])
+        learns, asked = ctx.needs_input_grad[first:], ctx.needs_input_grad[2:first]
+        grads, below = ctx.run.backward_to(grad, learns, asked, *further)
         below = [None if by_x is None else by_x.view(x.shape) for by_x, x in zip(below, inputs, strict=True)]
         return None, None, *below, *grads
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from abc import ABC
 from collections.abc import Sequence
+from functools import partial
 from typing import Annotated, ClassVar
 
 import torch
@@ -15,9 +16,10 @@ from torch import Tensor, nn
 
 from esp_cli.networks.contract import ActivationName, Generators, IoSpec
 from esp_cli.networks.kernels.library import begin, computes
-from esp_cli.networks.kernels.sets import compiled_distances, compiled_pool
+from esp_cli.networks.kernels.sets import PooledPass, compiled_distances
 from esp_cli.networks.layers import GAINS, SeedMLP
 from esp_cli.networks.ordering import joined, place_of, reader_of, ways_to
+from esp_cli.networks.perceptron import passed
 from esp_cli.networks.plain import CompiledConfig
 from esp_envs.errors import UserError
 from esp_envs.spec import Items, Layout
@@ -135,7 +137,8 @@ class Embedding(SeedMLP):
     def pooled(self, *parts: Tensor, each: bool = False) -> tuple[Tensor, Tensor | None]:
         """Return mean and maximum over the embedded things [S, B, K, .] of sets: [S, B, 2H], and where asked each."""
         if computes(self.compiled, parts[0]):
-            return compiled_pool(parts, self._from(0), self.activation, each)
+            found = passed(partial(PooledPass, self.activation, each), parts, self._from(0))
+            return found if each else (found, None)
         things = self(*parts)
         return torch.cat([things.mean(2), things.amax(2)], -1), things
 

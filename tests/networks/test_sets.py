@@ -2,13 +2,15 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
 
 from esp_cli.networks.build import build_network
 from esp_cli.networks.contract import IoSpec
-from esp_cli.networks.kernels.sets import compiled_distances, compiled_pool
+from esp_cli.networks.kernels.sets import PooledPass, compiled_distances
+from esp_cli.networks.perceptron import passed
 from esp_cli.networks.plain import MlpConfig
 from esp_cli.networks.set_equivariant import SetEquivariantConfig
 from esp_cli.networks.set_features import Embedding, Rows, distances_among
@@ -91,7 +93,7 @@ def test_a_pool_by_the_kernel_equals_that_by_torch(activation, rows, things):
 @needs_compiler
 def test_a_pool_by_hand_and_the_first_of_equal_maxima_takes_the_gradient():
     things = torch.tensor([[[[1.0, 4.0], [3.0, 4.0]]]], requires_grad=True)
-    pooled, _ = compiled_pool([things], [torch.eye(2)[None], torch.zeros(1, 1, 2)], "relu", each=False)
+    pooled = passed(partial(PooledPass, "relu", False), [things], [torch.eye(2)[None], torch.zeros(1, 1, 2)])
     assert pooled.flatten().tolist() == [2.0, 4.0, 3.0, 4.0]
     pooled.backward(torch.tensor([[[10.0, 20.0, 1.0, 2.0]]]))
     assert things.grad.flatten().tolist() == [5.0, 12.0, 6.0, 10.0]
@@ -248,7 +250,7 @@ def test_a_seed_gets_the_same_bits_alone_and_with_any_number_of_threads():
 
     def results(seeds):
         leaves = [w[seeds].clone().requires_grad_() for w in weights]
-        pooled, _ = compiled_pool([things[seeds]], leaves, "tanh", each=False)
+        pooled = passed(partial(PooledPass, "tanh", False), [things[seeds]], leaves)
         slopes = torch.autograd.grad(pooled.square().sum(), leaves)
         return [*compiled_distances([p[seeds] for p in places]), pooled.detach(), *slopes]
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 from itertools import accumulate, pairwise
 from math import prod
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
@@ -173,7 +173,7 @@ class CompiledPass:
         self._pull(grad, found, Below(below.data_ptr() if wanted else None, first, end))
         return self._split(found, learns), [at and below[..., at[0] - first : at[1] - first] for at in columns]
 
-    def _passed(self, like: Tensor, columns_first: bool) -> Tensor:
+    def _passed(self, like: Tensor, columns_first: bool) -> Any:
         """Go through all layers and return what the last one gives."""
         (num_seeds, num_rows), width = self._size, self._plan.widths[-1]
         size = (num_seeds, width, num_rows) if columns_first else (num_seeds, num_rows, width)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -41,65 +42,38 @@ def sort_things(rows: Tensor, columns: Tensor, at: int, reader: int | None) -> N
     )
 
 
-class _PooledPass(CompiledPass):
-    """A pass of things [S, B, K, .] whose outputs are mean and maximum over each set, [S, B, 2H].
+class PooledPass(CompiledPass):
+    """A pass of things [S, B, K, .] through a perceptron that ends with an activation.
 
-    To compute what layers give to many things costs less than to keep it; `each` has it [S, B, K, H], where asked for.
-    Its owner may fill in the gradient by that, `by_each`, before `backward_to`.
+    The outputs are mean and maximum over each set, [S, B, 2H], and for `each` also what it gives of each thing, [S, B,
+    K, H]. To compute what layers give to many things costs less than to keep it.
     """
 
     computes_again = True
 
     def __init__(
-        self, parts: Sequence[Tensor], parameters: Sequence[Tensor], activation: str, keep: bool, each: bool
+        self, activation: str, each: bool, parts: Sequence[Tensor], parameters: Sequence[Tensor], keep: bool
     ) -> None:
-        self._sets, width = parts[0].shape[:3], parameters[-1].shape[-1]
-        self.each = parts[0].new_empty(*self._sets, width) if each else None
-        self.by_each: Tensor | None = None
+        self._sets, self._each = parts[0].shape[:3], each
+        self._by_each: Tensor | None = None
         super().__init__(parts, parameters, activation, True, keep=keep, things=self._sets[2])
 
-    def _passed(self, like: Tensor, columns_first: bool) -> Tensor:
-        outputs = like.new_empty(*self._sets[:2], 2 * self._plan.widths[-1])
-        call("sets", "pool", self._arguments, RowsAt.of(outputs), _rows(self.each))
-        return outputs
+    def backward_to(
+        self, grad: Tensor, learns: Sequence[bool], asked: Sequence[bool], by_each: Tensor | None = None
+    ) -> tuple[list[Tensor | None], list[Tensor | None]]:
+        self._by_each = None if by_each is None else by_each.contiguous()
+        return super().backward_to(grad.contiguous(), learns, asked)
+
+    def _passed(self, like: Tensor, columns_first: bool) -> Any:
+        width = self._plan.widths[-1]
+        outputs = like.new_empty(*self._sets[:2], 2 * width)
+        things = like.new_empty(*self._sets, width) if self._each else None
+        call("sets", "pool", self._arguments, RowsAt.of(outputs), _rows(things))
+        return outputs if things is None else (outputs, things)
 
     def _pull(self, grad: Tensor, found: Tensor | None, below: Below) -> None:
-        grad, by_each = grad.contiguous(), None if self.by_each is None else self.by_each.contiguous()
-        call("sets", "pool_backward", self._arguments, RowsAt.of(grad), _rows(by_each), found, below)
+        call("sets", "pool_backward", self._arguments, RowsAt.of(grad), _rows(self._by_each), found, below)
 
 
 def _rows(things: Tensor | None) -> RowsAt:
     return RowsAt() if things is None else RowsAt.of(things.flatten(1, 2))
-
-
-class _Pooled(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, activation, each, num_parts, *tensors):  # type: ignore[no-untyped-def]
-        ctx.set_materialize_grads(False)
-        run = _PooledPass(tensors[:num_parts], tensors[num_parts:], activation, True, each)
-        ctx.num_parts, ctx.run = num_parts, run
-        ctx.save_for_backward(*tensors)  # so that autograd notices a change of them
-        things, run.each = run.each, None
-        return run.outputs.detach(), things
-
-    @staticmethod
-    def backward(ctx, grad, by_each):  # type: ignore[no-untyped-def]
-        parts, first = ctx.saved_tensors[: ctx.num_parts], 3 + ctx.num_parts
-        ctx.run.by_each, grad = by_each, torch.zeros_like(ctx.run.outputs) if grad is None else grad
-        learns, asked = ctx.needs_input_grad[first:], ctx.needs_input_grad[3:first]
-        grads, below = ctx.run.backward_to(grad, learns, asked)
-        below = [None if by_x is None else by_x.view(x.shape) for by_x, x in zip(below, parts, strict=True)]
-        return None, None, None, *below, *grads
-
-
-def compiled_pool(
-    parts: Sequence[Tensor], parameters: Sequence[Tensor], activation: str, each: bool
-) -> tuple[Tensor, Tensor | None]:
-    """Pass things of sets [S, B, K, .] through a perceptron that ends with an activation.
-
-    Returned are mean and maximum over each set [S, B, 2H], and what it gives of each thing [S, B, K, H] where asked.
-    """
-    if torch.is_grad_enabled():
-        return _Pooled.apply(activation, each, len(parts), *parts, *parameters)  # type: ignore[no-untyped-call]
-    run = _PooledPass(parts, parameters, activation, keep=False, each=each)
-    return run.outputs, run.each
