@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.networks.contract import WithVJP
-from esp_cli.networks.kernels.choices import Clipped, Slope, divergences
+from esp_cli.networks.kernels.choices import Clipped, Slope
 from esp_cli.networks.perceptron import Deferred
 from esp_cli.symmetry.frame import Frame
 from esp_envs.errors import UserError
@@ -24,24 +24,37 @@ _HALF_LOG_TAU = 0.5 * math.log(2 * math.pi)
 Weights = Tensor | float  # A number, or [S, 1, R]
 
 
-class CategoricalPolicies:
-    """Choices among A actions with probabilities softmax(outputs), actions first; see `Categorical.normalise`.
-
-    A slope is by log-probabilities [S, A, P, R], up to a multiple of the probabilities: the softmax takes it away.
-    """
+class _Choices:
+    """Choices among A actions with probabilities softmax(outputs), actions first; see `Categorical.normalise`."""
 
     def __init__(self, outputs: WithVJP, frame: Frame) -> None:
         self._outputs, self._frame = outputs, frame
-        orders = frame.orders(outputs.size[-1]) if frame.parts > 1 else None
-        self._places = None if orders is None else _places(orders.expand(outputs.size[0], -1, -1))
-        if self._places is None:
-            logits = frame.pull_outputs(outputs.tensor).movedim(-1, 1).flatten(3)
+        num_seeds, *rows, _ = outputs.size
+        self.sizes = (num_seeds, frame.parts, prod(rows) // frame.parts)
+
+    @cached_property
+    def _places(self) -> Tensor | None:
+        orders = self._frame.orders(self._outputs.size[-1]) if self._frame.parts > 1 else None
+        return None if orders is None else _places(orders.expand(self.sizes[0], -1, -1))
+
+    @cached_property
+    def log_probs(self) -> Tensor:
+        """[S, A, P, R]."""
+        outputs, places = self._outputs.tensor, self._places
+        if places is None:
+            logits = self._frame.pull_outputs(outputs).movedim(-1, 1).flatten(3)
         else:
-            by_action = outputs.tensor.flatten(1, -2).transpose(1, 2).unflatten(2, (frame.parts, -1))
-            logits = by_action.reshape(-1, by_action.shape[3]).index_select(0, self._places).view(by_action.shape)
-        self.log_probs = torch.log_softmax(logits, 1)
-        self.probs = self.log_probs.exp()
-        self._inner, self.sizes = self.probs * self.log_probs, (len(logits), *self.probs.shape[2:])
+            by_action = outputs.flatten(1, -2).transpose(1, 2).unflatten(2, (self._frame.parts, -1))
+            logits = by_action.reshape(-1, by_action.shape[3]).index_select(0, places).view(by_action.shape)
+        return torch.log_softmax(logits, 1)
+
+    @cached_property
+    def probs(self) -> Tensor:
+        return self.log_probs.exp()
+
+    @cached_property
+    def _inner(self) -> Tensor:
+        return self.probs * self.log_probs
 
     def log_prob(self, action: Tensor, learned: int) -> Tensor:
         """Return log pi(action) [S, L, R] of the originals' actions [S, B, T, N(, W)]."""
@@ -58,6 +71,10 @@ class CategoricalPolicies:
     def _gap(self, copies: slice, originals: slice) -> Tensor:
         p, log_p, log_q = self.probs[:, :, copies], self.log_probs[:, :, copies], self.log_probs[:, :, originals]
         return p * (log_p - log_q)
+
+
+class CategoricalPolicies(_Choices):
+    """Choices by torch; a slope is by log-probabilities, up to a multiple of the probabilities, which softmax drops."""
 
     def add_slope(self, slope: Tensor | None, action: Tensor, by_log_prob: Tensor, by_entropy: Weights) -> Tensor:
         """Add the slope of what depends on log pi(action), by which it is [S, L, R], and on these entropies."""
@@ -89,28 +106,12 @@ class CategoricalPolicies:
         return [(self._outputs, self._frame.push_outputs(by_logits))]
 
 
-class CompiledCategoricalPolicies:
-    """`CategoricalPolicies` by a kernel, of copies that only reorder outputs; a slope says what to ask of it."""
+class CompiledCategoricalPolicies(_Choices):
+    """Choices whose slopes a kernel computes, of copies that only reorder outputs; a slope says what to ask of it."""
 
     def __init__(self, outputs: WithVJP, frame: Frame, orders: Tensor) -> None:
-        self._outputs, self._frame = outputs, frame
-        num_seeds, *rows, _ = outputs.size
-        self._orders = orders.expand(num_seeds, -1, -1).contiguous()
-        self.sizes = (num_seeds, frame.parts, prod(rows) // frame.parts)
-
-    @cached_property
-    def _by_torch(self) -> CategoricalPolicies:
-        return CategoricalPolicies(self._outputs, self._frame)
-
-    def log_prob(self, action: Tensor, learned: int) -> Tensor:
-        return self._by_torch.log_prob(action, learned)
-
-    def entropy(self, learned: int) -> Tensor:
-        return self._by_torch.entropy(learned)
-
-    def divergence(self, copies: slice, originals: slice) -> Tensor:
-        assert originals == slice(0, 1)
-        return divergences(self._outputs.tensor.flatten(1, -2), self._orders)[:, copies]
+        super().__init__(outputs, frame)
+        self._orders = orders.expand(self.sizes[0], -1, -1).contiguous()
 
     def add_clipped_slope(self, slope: Slope | None, clipped: Clipped) -> Slope:
         """Add the slope of a clipped objective and of entropies, one of each."""

@@ -12,7 +12,9 @@ struct Choices {
     int64_t by_seed, by_part, by_row, by_action;  // steps between the outputs [S, P, R, A]
     const int64_t *orders;               // [S, P, A]: which output of a part is the original's action
     const float *outputs;
-    float *gaps;  // [S, P, R], KL[part || original]
+
+    // Two numbers of each action, of a vector of rows of all parts and of one part more.
+    int64_t room() const { return 2 * (parts + 1) * actions * LANES; }
 };
 
 // What losses add to the slope by the outputs. No data: they do not, or the weight is a number.
@@ -36,16 +38,6 @@ struct Batch {
     int64_t row(int64_t part, int64_t parts) const { return (seed * parts + part) * of.rows + begin; }
     Vec read(const float *x, int64_t at) const { return load(x + at, count); }
 };
-
-template <class Use>
-void each_batch(const Choices &of, int64_t vectors, Use use) {
-    const Shares shares(of.seeds, of.rows, 256, of.threads);
-    auto work = [&](int64_t task, float *own) {
-        for (Span left = shares.of(task); left.size() > 0; left.begin += LANES)
-            use(Batch{of, task / shares.parts, left.begin, std::min<int64_t>(LANES, left.size())}, &vec(own));
-    };
-    share_out(shares, 0, vectors * LANES, [](int64_t) {}, work, [](int64_t) {});
-}
 
 // Compute the log-probabilities of a part, and its probabilities behind them.
 void softmax(const Batch &batch, int64_t part, Vec *log_prob) {
@@ -103,33 +95,28 @@ void back_part(const Batch &batch, const Slope &slope, int64_t part, const Vec *
     }
 }
 
-// Write the slope by the outputs of all parts, with room for two numbers of each action of one part more.
-void back(const Batch &batch, const Slope &slope, Vec *room, float *by_outputs) {
-    const int64_t step = 2 * batch.of.actions;
-    for (int64_t k = 0; k < batch.of.parts; k++) softmax(batch, k, room + k * step);
-    for (int64_t k = 0; k < batch.of.parts; k++)
-        back_part(batch, slope, k, room, room + batch.of.parts * step, by_outputs);
+// Write the slope by the outputs of all parts of some rows.
+void back_rows(const Choices &of, int64_t seed, Span rows, const Slope &slope, float *room, float *by_outputs) {
+    const int64_t step = 2 * of.actions;
+    for (Vec *known = &vec(room); rows.size() > 0; rows.begin += LANES) {
+        const Batch batch{of, seed, rows.begin, std::min<int64_t>(LANES, rows.size())};
+        for (int64_t k = 0; k < of.parts; k++) softmax(batch, k, known + k * step);
+        for (int64_t k = 0; k < of.parts; k++)
+            back_part(batch, slope, k, known, known + of.parts * step, by_outputs);
+    }
 }
 
 }  // namespace
 
 extern "C" {
 
-void gaps(const Choices *choices) {
-    each_batch(*choices, 4 * choices->actions, [](const Batch &batch, Vec *first) {
-        const int64_t actions = batch.of.actions;
-        for (int64_t k = 0; k < batch.of.parts; k++) {
-            Vec *log_prob = first + (k > 0) * 2 * actions, gap = {};
-            softmax(batch, k, log_prob);
-            for (int64_t a = 0; a < actions; a++) gap += log_prob[actions + a] * (log_prob[a] - first[a]);
-            store(gap, batch.of.gaps + batch.row(k, batch.of.parts), batch.count);
-        }
-    });
-}
-
+// Compute the slope by the outputs, as they lie.
 void choose_backward(const Choices *choices, const Slope *slope, float *by_outputs) {
-    each_batch(*choices, 2 * (choices->parts + 1) * choices->actions,
-               [=](const Batch &batch, Vec *room) { back(batch, *slope, room, by_outputs); });
+    const Shares shares(choices->seeds, choices->rows, 256, choices->threads);
+    auto work = [&](int64_t task, float *room) {
+        back_rows(*choices, task / shares.parts, shares.of(task), *slope, room, by_outputs);
+    };
+    share_out(shares, 0, choices->room(), [](int64_t) {}, work, [](int64_t) {});
 }
 
 // Compute the gradients by the parameters of a perceptron whose outputs are the choices; rows are [R, P].
@@ -139,9 +126,8 @@ void learn_choices(const Perceptron *given, const Choices *choices, const Slope 
         here.by_seed = 0, here.by_part = width, here.by_row = here.parts * width, here.by_action = 1;
         Span left{span.begin / here.parts, span.end / here.parts};
         here.outputs = outputs -= left.begin * here.by_row;
-        Scratch room = scratch(2 * (here.parts + 1) * here.actions * LANES);
-        for (; left.size() > 0; left.begin += LANES)
-            back(Batch{here, seed, left.begin, std::min<int64_t>(LANES, left.size())}, *slope, &vec(room.get()), outputs);
+        Scratch room = scratch(here.room());
+        back_rows(here, seed, left, *slope, room.get(), outputs);
     });
 }
 

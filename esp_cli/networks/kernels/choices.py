@@ -16,7 +16,7 @@ class _Choices(ctypes.Structure):
     _fields_ = (
         *fields(ctypes.c_int64, "seeds", "parts", "rows", "actions", "threads"),
         *fields(ctypes.c_int64, "by_seed", "by_part", "by_row", "by_action"),
-        *fields(ctypes.c_void_p, "orders", "outputs", "gaps"),
+        *fields(ctypes.c_void_p, "orders", "outputs"),
     )
 
 
@@ -76,29 +76,18 @@ class Slope(NamedTuple):
         return run.learn("choices", "learn_choices", _Choices(*sizes, orders=orders.data_ptr()), self.asked())
 
     def back(self, outputs: Tensor, orders: Tensor) -> Tensor:
-        """Return the slope by outputs, laid out as they are; arguments as of `divergences`."""
+        """Return the slope by outputs, laid out as they are.
+
+        The outputs [S, P R, A] are of P parts, the originals and copies, whose actions contiguous int64 orders [S, P,
+        A] bring to those of the originals.
+        """
         by_outputs = torch.empty_like(outputs)
         if by_outputs.stride() != outputs.stride():
             by_outputs = torch.empty_strided(outputs.shape, outputs.stride())
-        call("choices", "choose_backward", _choices(outputs, orders), self.asked(), by_outputs)
+        (num_seeds, num_parts, num_actions), (by_seed, by_row, by_action) = orders.shape, outputs.stride()
+        num_rows = outputs.shape[1] // num_parts
+        sizes = (num_seeds, num_parts, num_rows, num_actions, torch.get_num_threads())
+        steps = (by_seed, by_row * num_rows, by_row, by_action)
+        choices = _Choices(*sizes, *steps, orders.data_ptr(), outputs.data_ptr())
+        call("choices", "choose_backward", choices, self.asked(), by_outputs)
         return by_outputs
-
-
-def divergences(outputs: Tensor, orders: Tensor) -> Tensor:
-    """Return KL[part || original] [S, P, R] of choices by softmax.
-
-    The outputs [S, P R, A] are of P parts, the originals and copies, whose actions contiguous int64 orders [S, P, A]
-    bring to those of the originals.
-    """
-    num_seeds, num_parts, _ = orders.shape
-    gaps = outputs.new_empty(num_seeds, num_parts, outputs.shape[1] // num_parts)
-    call("choices", "gaps", _choices(outputs, orders, gaps))
-    return gaps
-
-
-def _choices(outputs: Tensor, orders: Tensor, gaps: Tensor | None = None) -> _Choices:
-    num_seeds, num_parts, num_actions = orders.shape
-    num_rows, (by_seed, by_row, by_action) = outputs.shape[1] // num_parts, outputs.stride()
-    sizes = (num_seeds, num_parts, num_rows, num_actions, torch.get_num_threads())
-    found = None if gaps is None else gaps.data_ptr()
-    return _Choices(*sizes, by_seed, by_row * num_rows, by_row, by_action, orders.data_ptr(), outputs.data_ptr(), found)
