@@ -46,19 +46,6 @@ struct Layout : Unit {
     const float *parameter(int64_t k, int64_t seed) const { return parameters[k] + seed * strides[k]; }
 };
 
-// Copy a matrix [rows, 3 H], whose parts are r, z and n, to where they stand in [rows, 3 padded(H)]; or back, or turned.
-struct Packing {
-    int64_t hidden, width;
-    const int64_t *place;
-
-    template <class Use>
-    void each(int64_t rows, Use use) const {  // use(row, column there, column here)
-        for (int64_t r = 0; r < rows; r++)
-            for (int64_t gate = 0; gate < 3; gate++)
-                for (int64_t h = 0; h < hidden; h++) use(r, gate * hidden + h, place[gate] * width + h);
-    }
-};
-
 // The parameters of a seed as the products want them.
 struct Weights {
     float *input, *memory, *bias;  // [inputs, 3 W], [H, 3 W], [4 W]
@@ -68,17 +55,24 @@ struct Weights {
         : input(at), memory(at + unit.inputs * 3 * unit.width), bias(memory + unit.hidden * 3 * unit.width) {}
 };
 
+// Go through the numbers of all parameters [rows, 3 H]: use(k, number of the k-th, row, column among the parts here).
+template <class Use>
+void each_parameter(const Layout &unit, Use use) {
+    const int64_t rows[4] = {unit.inputs, 1, unit.hidden, 1};
+    for (int64_t k = 0; k < 4; k++)
+        for (int64_t r = 0; r < rows[k]; r++)
+            for (int64_t gate = 0; gate < 3; gate++)
+                for (int64_t h = 0; h < unit.hidden; h++)
+                    use(k, (r * 3 + gate) * unit.hidden + h, r, (k < 2 ? GATE : INNER)[gate] * unit.width + h);
+}
+
 void pack(const Layout &unit, int64_t seed, float *at) {
-    Weights to(unit, at);
-    int64_t width = unit.width, row = 3 * width, from_row = 3 * unit.hidden;
+    const Weights to(unit, at);
+    float *const parts[4] = {to.input, to.bias, to.memory, to.bias + unit.width};
     std::fill(at, at + Weights::room(unit), 0.0f);
-    Packing gates{unit.hidden, width, GATE}, inner{unit.hidden, width, INNER};
-    const float *weight = unit.parameter(0, seed), *bias = unit.parameter(1, seed);
-    const float *recurrent = unit.parameter(2, seed), *inner_bias = unit.parameter(3, seed);
-    gates.each(unit.inputs, [&](int64_t r, int64_t c, int64_t k) { to.input[r * row + k] = weight[r * from_row + c]; });
-    inner.each(unit.hidden, [&](int64_t r, int64_t c, int64_t k) { to.memory[r * row + k] = recurrent[r * from_row + c]; });
-    gates.each(1, [&](int64_t, int64_t c, int64_t k) { to.bias[k] += bias[c]; });
-    inner.each(1, [&](int64_t, int64_t c, int64_t k) { to.bias[width + k] += inner_bias[c]; });
+    each_parameter(unit, [&](int64_t k, int64_t i, int64_t r, int64_t column) {
+        parts[k][r * 3 * unit.width + column] += unit.parameter(k, seed)[i];
+    });
 }
 
 inline Vec sigmoid_of(Vec x) { return reciprocal(1.0f + exp_of(-x)); }
@@ -142,14 +136,13 @@ void learn(const Layout &unit, const Weights &sum, Matrix x, const float *before
 
 // Turn a seed's weights: W' [3 W, padded(inputs)] and, behind it, U' [3 W, W].
 void turn(const Layout &unit, int64_t seed, float *input) {
-    int64_t width = unit.width, below = padded(unit.inputs), row = 3 * unit.hidden;
+    int64_t width = unit.width, below = padded(unit.inputs);
     float *memory = input + 3 * width * below;
     std::fill(input, memory + 3 * width * width, 0.0f);
-    const float *weight = unit.parameter(0, seed), *recurrent = unit.parameter(2, seed);
-    Packing{unit.hidden, width, GATE}.each(
-        unit.inputs, [&](int64_t r, int64_t c, int64_t k) { input[k * below + r] = weight[r * row + c]; });
-    Packing{unit.hidden, width, INNER}.each(
-        unit.hidden, [&](int64_t r, int64_t c, int64_t k) { memory[k * width + r] = recurrent[r * row + c]; });
+    each_parameter(unit, [&](int64_t k, int64_t i, int64_t r, int64_t column) {
+        if (k == 0) input[column * below + r] = unit.parameter(k, seed)[i];
+        if (k == 2) memory[column * width + r] = unit.parameter(k, seed)[i];
+    });
 }
 
 struct Gradients {
@@ -184,21 +177,16 @@ void backward_block(const Layout &unit, int64_t seed, Span span, const Gradients
 }
 
 // Add the sums of a seed's parts to its gradients, W, b, U and b' in a row.
-void add_up(const Layout &unit, float *sums, float *weight) {
-    int64_t hidden = unit.hidden, width = unit.width, row = 3 * hidden;
-    float *bias = weight + unit.inputs * row, *recurrent = bias + row, *inner_bias = recurrent + hidden * row;
-    Packing gates{hidden, width, GATE}, inner{hidden, width, INNER};
-    std::fill(weight, inner_bias + row, 0.0f);
+void add_up(const Layout &unit, float *sums, float *gradients) {
+    const int64_t row = 3 * unit.hidden, in = unit.inputs, ends = in + unit.hidden + 2;
+    float *const to[4] = {gradients, gradients + in * row, gradients + (in + 1) * row, gradients + (ends - 1) * row};
+    std::fill(gradients, gradients + ends * row, 0.0f);
     for (int64_t part = 0; part < unit.shares.parts; part++, sums += Weights::room(unit)) {
         const Weights sum(unit, sums);
-        gates.each(unit.inputs, [&](int64_t r, int64_t c, int64_t k) {
-            weight[r * row + c] += sum.input[r * 3 * width + k];
+        const float *const from[4] = {sum.input, sum.bias, sum.memory, sum.bias + unit.width};
+        each_parameter(unit, [&](int64_t k, int64_t i, int64_t r, int64_t column) {
+            to[k][i] += from[k][r * 3 * unit.width + column];
         });
-        gates.each(1, [&](int64_t, int64_t c, int64_t k) { bias[c] += sum.bias[k]; });
-        inner.each(hidden, [&](int64_t r, int64_t c, int64_t k) {
-            recurrent[r * row + c] += sum.memory[r * 3 * width + k];
-        });
-        inner.each(1, [&](int64_t, int64_t c, int64_t k) { inner_bias[c] += sum.bias[width + k]; });
     }
 }
 
