@@ -100,7 +100,7 @@ class OffPolicyLearner(Learner):
             self.anneal(1.0 - progress)
         learned = 0
         for _ in range(config.rounds):
-            self.explore()
+            explored = self.explore()
             episodes, mean_return = self.collector.collect()
             returns.append(mean_return)
             self._store(episodes)
@@ -112,7 +112,7 @@ class OffPolicyLearner(Learner):
                     sums[name] = sums.get(name, 0.0) + value.detach()
                 self.updates += 1
                 learned += 1
-        metrics = {"train/return": torch.stack(returns).mean(0), **self.exploration()}
+        metrics = {"train/return": torch.stack(returns).mean(0), **explored}
         metrics["train/augmented_share"] = self.prior.augmented_share(len(mean_return))
         if learned:
             metrics |= {f"train/{name}": value / learned for name, value in sums.items()}
@@ -128,11 +128,8 @@ class OffPolicyLearner(Learner):
     def answers(self, rows: EpisodeBatch) -> Answers:
         """Return what the networks say of rows, for `SymmetryPrior.errors`."""
 
-    def explore(self) -> None:
-        """Set how the policy explores in the next round."""
-
-    def exploration(self) -> dict[str, Tensor]:
-        """Return what is logged of the exploration, each [S]."""
+    def explore(self) -> dict[str, Tensor]:
+        """Set how the policy explores in the next round, and return what is logged of it, each [S]."""
         return {}
 
     def _store(self, episodes: EpisodeBatch) -> None:
@@ -217,18 +214,13 @@ class ExploringLearner(OffPolicyLearner):
 
     config: ExploringConfig
 
-    def explore(self) -> None:
-        config = self.config
+    def explore(self) -> dict[str, Tensor]:
+        config, head = self.config, self.policy.head
+        assert isinstance(head, ExploringHead)
         share = min(self.episodes * self.spec.horizon / config.epsilon_steps, 1.0)
         fallen = config.epsilon_start + share * (config.epsilon_finish - config.epsilon_start)
-        self._schedule.explore(1.0 if self.episodes < config.warmup_episodes else fallen)
-
-    def exploration(self) -> dict[str, Tensor]:
-        return {"train/epsilon": self._schedule.epsilon.clone()}
-
-    @property
-    def _schedule(self) -> ExploringHead:
-        return self.policy.head  # type: ignore[return-value]
+        head.explore(1.0 if self.episodes < config.warmup_episodes else fallen)
+        return {"train/epsilon": head.epsilon.clone()}
 
 
 PROBE_EPISODES = 4  # episodes per seed on which the symmetry errors are measured once an iteration

@@ -30,11 +30,7 @@ class SeedGRU(nn.Module):
 
     def forward(self, x: Tensor, h: Tensor) -> Tensor:
         """Advance one step: x [S, B, in], h [S, B, H] -> h' [S, B, H]."""
-        return self.advance(self.input(x), h)
-
-    def advance(self, projected: Tensor, h: Tensor) -> Tensor:
-        """Advance one step from the already projected input [S, B, 3H]."""
-        xr, xz, xn = projected.chunk(3, -1)
+        xr, xz, xn = self.input(x).chunk(3, -1)
         hr, hz, hn = self.recurrent(h).chunk(3, -1)
         reset, update = torch.sigmoid(xr + hr), torch.sigmoid(xz + hz)
         candidate = torch.tanh(torch.addcmul(xn, reset, hn))

@@ -145,29 +145,23 @@ void turn(const Layout &unit, int64_t seed, float *input) {
     });
 }
 
-struct Gradients {
-    const float *by_memories;  // [S, T, R, H], with its steps
-    const int64_t *strides;
-    float *by_inputs;  // [S, T, R, inputs]
-};
-
-// Pull the gradient by all memories of some rows back; `own` has room for one step, and the weights are turned.
-void backward_block(const Layout &unit, int64_t seed, Span span, const Gradients &gradients, const float *input,
-                    const Weights &sum, float *own, const float *none) {
+// Pull the gradient by all memories of some rows, [S, T, R, H] with its steps, back to the parameters and to the inputs,
+// [S, T, R, inputs]; `own` has room for one step, and the weights are turned.
+void backward_block(const Layout &unit, int64_t seed, Span span, const float *by_memories, const int64_t *strides,
+                    const float *input, const Weights &sum, float *by_inputs, float *own, const float *none) {
     int64_t width = unit.width, rows = span.size(), below = padded(unit.inputs);
     const float *memory = input + 3 * width * below;
-    const int64_t *strides = gradients.strides;
     float *carry = own, *d = carry + BLOCK * width, *by_x = d + BLOCK * 4 * width;
     std::fill(carry, carry + rows * width, 0.0f);
     for (int64_t t = unit.steps - 1; t >= 0; t--) {
-        const float *above = gradients.by_memories + seed * strides[0] + t * strides[1] + span.begin * strides[2];
+        const float *above = by_memories + seed * strides[0] + t * strides[1] + span.begin * strides[2];
         for (int64_t r = 0; r < rows; r++)
             for (int64_t h = 0; h < unit.hidden; h++) carry[r * width + h] += above[r * strides[2] + h];
         const float *before = unit.before(seed, t, span.begin, none);
         pull(rows, width, unit.kept(seed, t, span.begin), before, carry, d);
         learn(unit, sum, unit.input(seed, t, span.begin), before, rows, d);
         product(rows, below, 3 * width, {d, 4 * width, 1}, input, below, nullptr, false, by_x, below);
-        float *to = gradients.by_inputs + ((seed * unit.steps + t) * unit.rows + span.begin) * unit.inputs;
+        float *to = by_inputs + ((seed * unit.steps + t) * unit.rows + span.begin) * unit.inputs;
         copy(rows, unit.inputs, {by_x, below, 1}, to, unit.inputs, 1);
         if (unit.truncation && t % unit.truncation == 0)
             std::fill(carry, carry + rows * width, 0.0f);
@@ -214,7 +208,6 @@ void gru_forward(const Unit *given) {
 void gru_backward(const Unit *given, const float *by_memories, const int64_t *strides, float *by_parameters,
                   float *by_inputs) {
     const Layout unit(*given);
-    const Gradients gradients{by_memories, strides, by_inputs};
     int64_t width = unit.width, room = Weights::room(unit), below = padded(unit.inputs), size = BLOCK * width;
     int64_t turned_room = 3 * width * (below + width), count = 3 * unit.hidden * (unit.inputs + unit.hidden + 2);
     Scratch turned = scratch(unit.seeds * turned_room), sums = scratch(unit.shares.tasks * room);
@@ -226,7 +219,8 @@ void gru_backward(const Unit *given, const float *by_memories, const int64_t *st
             std::fill(sum, sum + room, 0.0f);
             unit.shares.blocks(task, BLOCK, [&](int64_t seed, Span span, bool) {
                 const float *input = turned.get() + seed * turned_room;
-                backward_block(unit, seed, span, gradients, input, Weights(unit, sum), own + size, own);
+                backward_block(unit, seed, span, by_memories, strides, input, Weights(unit, sum), by_inputs, own + size,
+                               own);
             });
         },
         [&](int64_t s) { add_up(unit, sums.get() + s * unit.shares.parts * room, by_parameters + s * count); });
