@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -11,24 +12,35 @@ from esp_cli.networks.contract import IoSpec, Network, WithVJP
 from esp_cli.networks.kernels.library import begin, computes
 from esp_cli.networks.kernels.sets import sort_things
 from esp_envs.errors import UserError
-from esp_envs.spec import Family, Kind, Layout
+from esp_envs.spec import Family, Field, Kind, Layout
+
+
+def items_of(fields: Iterable[Field]) -> Iterator[tuple[Field, int]]:
+    """Give the field of each item of fields side by side, and its first column; of a record, those of its parts."""
+    start = 0
+    for field in fields:
+        for _ in range(field.count):
+            parts = items_of(field.parts) if field.kind == Kind.RECORD else [(field, 0)]
+            yield from ((part, start + column) for part, column in parts)
+            start += field.item_width
+
+
+def fields_of_one(family: Family) -> list[Field]:
+    """Return the fields of one thing."""
+    return [replace(field, count=1) for field, _ in family.parts]
 
 
 def place_of(family: Family) -> int | None:
     """Return the column of a thing's numbers at which its place begins: a point, else its first planar vector."""
-    columns, start = [], 0
-    for field, _ in family.parts:
-        for part in field.parts or (field,):
-            if part.kind == Kind.VECTOR:
-                columns.append((not part.is_point, start))
-            start += part.item_width if part is field else part.width
+    items = items_of(fields_of_one(family))
+    columns = [(not field.is_point, column) for field, column in items if field.kind == Kind.VECTOR]
     return min(columns)[1] if columns else None
 
 
 def reader_of(layout: Layout, family: Family) -> int | None:
     """Return the column of the reader's own place, where things are points; None where it is the origin."""
     own = [part.where.start for part in layout.own if part.field.is_point]
-    points = any(part.is_point for field, _ in family.parts for part in field.parts or (field,))
+    points = any(field.is_point for field, _ in items_of(fields_of_one(family)))
     return own[0] if own and points else None
 
 

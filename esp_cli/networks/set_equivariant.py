@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from esp_cli.networks.contract import Generators, IoSpec, Memoryless, Network
 from esp_cli.networks.layers import SeedLinear, SeedMLP
+from esp_cli.networks.ordering import fields_of_one, items_of
 from esp_cli.networks.set_features import Rows, TeamFeatures
 from esp_cli.networks.sets import SetConfig, SetNetwork, sets_or_refuse
 from esp_envs.errors import UserError
@@ -55,19 +56,11 @@ class SetEquivariantConfig(SetConfig):
 
 def _columns(fields: Sequence[Field]) -> tuple[list[int], list[int]]:
     """Return the columns at which vectors begin, and those of scalars, of the items of fields side by side."""
-    vectors, scalars, start = list[int](), list[int](), 0
-    for field in fields:
-        if field.kind == Kind.RECORD:
-            inner = _columns(field.parts)
-            vectors += [start + column for column in inner[0]]
-            scalars += [start + column for column in inner[1]]
-            start += field.item_width
-            continue
+    vectors, scalars = list[int](), list[int]()
+    for field, column in items_of(fields):
         if field.kind not in (Kind.VECTOR, Kind.SCALAR):
             raise UserError(f"set-equivariant reads vectors and scalars, but '{field.name}' is a {field.kind.name}")
-        for _ in range(field.count):
-            (vectors if field.kind == Kind.VECTOR else scalars).append(start)
-            start += field.kind.width
+        (vectors if field.kind == Kind.VECTOR else scalars).append(column)
     return vectors, scalars
 
 
@@ -82,11 +75,7 @@ class InvariantRows(Rows):
     ) -> None:
         super().__init__(layout, shifts, near, compiled)
         self.own_columns = _columns([part.field for part in layout.own if part.where in self.own])
-        one = [
-            [Field(part.field.name, part.field.kind, 1, parts=part.field.parts) for part in family.parts]
-            for family in self.families
-        ]
-        self.columns = [_columns(fields) for fields in one]
+        self.columns = [_columns(fields_of_one(family)) for family in self.families]
         count = len(self.own_columns[0])
         self.num_own = len(self.own_columns[1]) + count * (count + 3) // 2
         far = [width - family.width for width, family in zip(self.widths, self.families, strict=True)]

@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 
 from esp_cli.networks.contract import IoSpec, Memoryless, Network
+from esp_cli.networks.ordering import items_of
 from esp_cli.symmetry.maps import map_of
 from esp_cli.symmetry.plane import PlaneElement
 from esp_cli.symmetry.representation import layout_operator
 from esp_envs.errors import UserError
-from esp_envs.spec import ActionSpace, Discrete, Kind, Layout
+from esp_envs.spec import ActionSpace, Discrete, Kind
 
 LOCAL = "local-"  # begins the name of a group whose elements are chosen by the input's frame, as "local-d4"
 
@@ -76,11 +77,13 @@ class LocalFrame(Memoryless, Symmetrised):
         sector = Fraction(1, self.group.order)
         on_axis = PlaneElement(sector, mirrored=True) in map(PlaneElement.of, self.group.elements)
         angle = math.pi * sector * (2 if on_axis else 1)  # a mirror leaves a direction on its axis alone
-        along = _on_vectors(io.layout, (math.cos(angle), math.sin(angle)))
-        if not any(along):
+        vectors = [column for field, column in items_of(io.layout.fields) if field.kind == Kind.VECTOR]
+        if not vectors:
             raise UserError(f"network.symmetrise={LOCAL}{group} needs vectors, and {io.spaces.label} shows none")
+        along = torch.zeros(io.layout.width)
+        along[vectors], along[[column + 1 for column in vectors]] = math.cos(angle), math.sin(angle)
         self.along: Tensor
-        self.register_buffer("along", torch.tensor(along), False)
+        self.register_buffer("along", along, False)
 
     def forward(self, x: Tensor) -> Tensor:
         images = self._images(x).unflatten(1, (self.group.order, -1))  # [S, G, B, in]
@@ -88,17 +91,6 @@ class LocalFrame(Memoryless, Symmetrised):
         own = images.gather(1, chosen[:, None, :, None].expand(-1, 1, -1, x.shape[-1]))
         y = self.network.unroll(own.transpose(1, 2))  # [S, B, 1, out]
         return (y @ self.back[chosen]).squeeze(-2)
-
-
-def _on_vectors(layout: Layout, direction: tuple[float, float]) -> list[float]:
-    """Return a row of a layout with the same direction in each of its vectors and 0 in all else."""
-    row: list[float] = []
-    for field in layout.fields:
-        if field.kind == Kind.RECORD:
-            row += _on_vectors(Layout(field.parts), direction) * field.count
-        else:
-            row += (direction if field.kind == Kind.VECTOR else (0.0,) * field.item_width) * field.count
-    return row
 
 
 def action_parts(space: ActionSpace) -> Tensor:
