@@ -16,11 +16,6 @@ import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from esp_cli.files.opening import open_own
-from esp_envs.errors import UserError
-
-MAX_LINE_BYTES = 16 * 2**20  # of a file of lines, such as metrics; what is longer was not written by this program
-TAIL_BYTES = 2**18  # longer than most lines
 TEMPORARY_PREFIX = ".esp-tmp-"  # of half-written files; what a killed process left under such a name may be removed
 
 
@@ -59,20 +54,6 @@ def replace_file(path: str | os.PathLike[str], content: bytes) -> None:
     """Replace a file as a whole by this content; see `replacing`."""
     with replacing(path) as write:
         write(content)
-
-
-def mend_last_line(path: Path) -> None:
-    """Remove what a kill left behind the last line break, so that the next line does not run into it."""
-    if not path.exists():
-        return
-    with os.fdopen(open_own(path, os.O_RDWR), "rb+", buffering=0) as file:
-        size, tail = file.seek(0, os.SEEK_END), b""
-        while b"\n" not in tail and len(tail) < size:
-            if len(tail) > MAX_LINE_BYTES:
-                raise UserError(f"{path} is damaged: its last line has more than 16 MiB; remove that line")
-            start = file.seek(max(0, size - max(2 * len(tail), TAIL_BYTES)))
-            tail = file.read(size - start)
-        file.truncate(size - len(tail.rpartition(b"\n")[2]))
 
 
 @contextlib.contextmanager

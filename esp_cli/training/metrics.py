@@ -23,7 +23,7 @@ from torch import Tensor
 
 from esp_cli.files.formatting import Shown, attempting
 from esp_cli.files.opening import open_own, open_regular
-from esp_cli.files.writing import MAX_LINE_BYTES, TAIL_BYTES, replacing, write_all
+from esp_cli.files.writing import replacing, write_all
 from esp_cli.training.trackers import Guarded
 from esp_envs.errors import UserError
 
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Value = float | None | list[float | None] | Tensor
 """What a row may hold under a name: a number, or one per seed; None where there is none, as for a stopped seed."""
+_MAX_LINE_BYTES = 16 * 2**20  # what is longer was not written by this program
+_TAIL_BYTES = 2**18  # longer than most lines
 
 
 class MetricsError(UserError):
@@ -86,10 +88,10 @@ def read_metrics(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
 
 def read_last_row(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Read the newest whole row of a metrics file that may be in use; empty where there is none yet."""
-    size, row = TAIL_BYTES, None
+    size, row = _TAIL_BYTES, None
     with contextlib.suppress(OSError), Path(path).open("rb") as file:
         end = start = file.seek(0, os.SEEK_END)
-        while row is None and start > 0 and size <= 2 * MAX_LINE_BYTES:
+        while row is None and start > 0 and size <= 2 * _MAX_LINE_BYTES:
             start = file.seek(max(0, end - size))
             lines = reversed(file.read().split(b"\n"))
             row = next((row for row in map(_parse, lines) if row is not None), None)
@@ -210,11 +212,11 @@ def _rows(path: Path) -> Iterator[tuple[bytes, dict[str, Any]]]:
         raise MetricsError(f"{path} does not exist or is not a regular file; check the path")
     with attempting("read", path, MetricsError), open_regular(path) as file:
         for number in itertools.count(1):
-            line = file.readline(MAX_LINE_BYTES)
+            line = file.readline(_MAX_LINE_BYTES)
             row = _parse(line)
             if row is not None:
                 yield line.removesuffix(b"\n"), row
-            elif line.endswith(b"\n") or len(line) == MAX_LINE_BYTES:
+            elif line.endswith(b"\n") or len(line) == _MAX_LINE_BYTES:
                 raise MetricsError(f"{path} is damaged: line {number} is not a row of metrics; remove that line")
             else:  # the end, or a line that a killed process had not finished
                 return

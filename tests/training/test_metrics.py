@@ -142,7 +142,7 @@ def test_a_torn_line_does_not_swallow_the_next_row(path):
 
 
 def test_the_last_row_is_found_however_long_it_is(path, monkeypatch):
-    monkeypatch.setattr(metrics, "TAIL_BYTES", 8)
+    monkeypatch.setattr(metrics, "_TAIL_BYTES", 8)
     with path.open("a") as file:
         file.write('{"step": 400, "train/l')
     assert read_last_row(path) == ROWS[-1]
