@@ -9,11 +9,9 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import functools
 import os
 import secrets
 import stat
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 TEMPORARY_PREFIX = ".esp-tmp-"  # of half-written files; what a killed process left under such a name may be removed
@@ -51,14 +49,7 @@ def refuse_unwritable(path: str | os.PathLike[str]) -> None:
 
 
 def replace_file(path: str | os.PathLike[str], content: bytes) -> None:
-    """Replace a file as a whole by this content; see `replacing`."""
-    with replacing(path) as write:
-        write(content)
-
-
-@contextlib.contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[Callable[[bytes], None]]:
-    """Replace a file as a whole by content that comes in parts, each given to the function that is yielded.
+    """Replace a file as a whole by this content.
 
     The bytes go to a temporary file in the same folder, which is flushed to the disk and renamed over ``path``; then
     the folder's own entry is flushed. A link there is replaced, not followed. After an exception the file is as before.
@@ -72,7 +63,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Callable[[bytes], None]]
             with contextlib.suppress(OSError):  # a new file, or one of somebody else
                 if stat.S_ISREG((before := path.lstat()).st_mode):
                     os.fchmod(descriptor, before.st_mode & 0o777)
-            yield functools.partial(write_all, descriptor)
+            write_all(descriptor, content)
             os.fsync(descriptor)
         finally:
             os.close(descriptor)

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from esp_cli.files.formatting import Shown, attempting
 from esp_cli.files.opening import open_own, open_regular
-from esp_cli.files.writing import replacing, write_all
+from esp_cli.files.writing import replace_file, write_all
 from esp_cli.training.trackers import Guarded
 from esp_envs.errors import UserError
 
@@ -104,10 +104,9 @@ def truncate_metrics(path: str | os.PathLike[str], last_step: int) -> None:
     path = Path(path)
     with attempting("write", path, MetricsError):
         os.close(open_own(path, os.O_WRONLY))
-    with attempting("write", path, MetricsError), replacing(path) as write:
-        for line, row in _rows(path):
-            if row["step"] <= last_step:
-                write(line + b"\n")
+    kept = b"".join(line + b"\n" for line, row in _rows(path) if row["step"] <= last_step)
+    with attempting("write", path, MetricsError):
+        replace_file(path, kept)
 
 
 def column(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
