@@ -25,7 +25,7 @@ from esp_cli.studies.study import StudyFolder, read_evaluation
 from esp_cli.training.build import spec_of
 from esp_cli.training.config import RunConfig
 from esp_cli.training.folder_names import METRICS
-from esp_cli.training.metrics import MetricsError, NoMetricError, column, elapsed_s, read_metrics
+from esp_cli.training.metrics import NoMetricError, column, elapsed_s, read_metrics
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.settings import parse_config
 from esp_envs.errors import UserError
@@ -78,7 +78,7 @@ def read_curve(path: Path, label: str | None, mode: Mode) -> RunCurve:
 def _curve(rows: Sequence[Mapping[str, Any]], mode: Mode, run: Path, label: str, config: RunConfig) -> RunCurve:
     try:
         steps, values = column(rows, f"eval/return_{mode}")
-    except MetricsError as error:
+    except UserError as error:
         raise type(error)(f"{run / METRICS}: {error}") from None
     if values.shape[1] != len(config.seeds):
         raise UserError(

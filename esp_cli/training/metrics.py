@@ -2,7 +2,7 @@
 
 A row is ``{"step": 12800, "train/policy_loss": [0.1, 0.2], "time/steps_per_second": 51000.0}``: ``step`` counts env
 steps per seed, a list has one number per seed, a bare number belongs to the run as a whole. What is not finite is
-``null``. A file that is missing, damaged elsewhere than at its end, or not to be written is a MetricsError.
+``null``. A file that is missing, damaged elsewhere than at its end, or not to be written is a UserError.
 """
 
 from __future__ import annotations
@@ -37,11 +37,7 @@ _MAX_LINE_BYTES = 16 * 2**20  # what is longer was not written by this program
 _TAIL_BYTES = 2**18  # longer than most lines
 
 
-class MetricsError(UserError):
-    """A metrics file cannot be written or read; the text is one sentence for the user."""
-
-
-class NoMetricError(MetricsError):
+class NoMetricError(UserError):
     """No row has a metric."""
 
 
@@ -50,7 +46,7 @@ class MetricsWriter:
 
     def __init__(self, path: str | os.PathLike[str], trackers: Sequence[Guarded] = ()) -> None:
         self._path, self._trackers = Path(path), trackers
-        with attempting("write", self._path, MetricsError):
+        with attempting("write", self._path):
             self._descriptor = open_own(self._path, os.O_WRONLY | os.O_APPEND)
 
     def __enter__(self) -> MetricsWriter:
@@ -69,12 +65,12 @@ class MetricsWriter:
         row: dict[str, Any] = {}
         for name, value in values.items():
             if name == "step":
-                raise MetricsError("'step' is the row's own column; give the metric another name")
+                raise UserError("'step' is the row's own column; give the metric another name")
             row[name] = numbers = _plain(name, value)
             if isinstance(numbers, list):
                 row[name] = [None if k in without else number for k, number in enumerate(numbers)]
         line = json.dumps({"step": int(step), **row}, allow_nan=False, separators=(",", ":")).encode() + b"\n"
-        with attempting("write", self._path, MetricsError):
+        with attempting("write", self._path):
             write_all(self._descriptor, line)
         for tracker in self._trackers:
             tracker.write(int(step), row)
@@ -102,10 +98,10 @@ def read_last_row(path: str | os.PathLike[str]) -> dict[str, Any]:
 def truncate_metrics(path: str | os.PathLike[str], last_step: int) -> None:
     """Rewrite a metrics file, or make it, without a torn last line and the rows past the step of a checkpoint."""
     path = Path(path)
-    with attempting("write", path, MetricsError):
+    with attempting("write", path):
         os.close(open_own(path, os.O_WRONLY))
     kept = b"".join(line + b"\n" for line, row in _rows(path) if row["step"] <= last_step)
-    with attempting("write", path, MetricsError):
+    with attempting("write", path):
         replace_file(path, kept)
 
 
@@ -122,11 +118,11 @@ def column(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[NDArray[np.int
         raise NoMetricError(f"no row has the metric '{name}'{hint}")
     lists = [value if isinstance(value, list) else [value] for _, value in found]
     if len({len(numbers) for numbers in lists}) > 1:
-        raise MetricsError(f"the rows of '{name}' differ in the number of seeds")
+        raise UserError(f"the rows of '{name}' differ in the number of seeds")
     try:
         values = np.array([[math.nan if v is None else float(v) for v in numbers] for numbers in lists])
     except (TypeError, ValueError, OverflowError):
-        raise MetricsError(f"the rows of '{name}' hold a value that is not a number") from None
+        raise UserError(f"the rows of '{name}' hold a value that is not a number") from None
     return np.array([step for step, _ in found], dtype=np.int64), values
 
 
@@ -201,22 +197,22 @@ def _plain(name: str, value: Value) -> float | list[float | None] | None:
     plain = value.tolist() if isinstance(value, Tensor) else value
     numbers = plain if isinstance(plain, list) else [plain]
     if not all(number is None or isinstance(number, int | float) for number in numbers):
-        raise MetricsError(f"the metric '{name}' is neither a number nor a list of one number per seed")
+        raise UserError(f"the metric '{name}' is neither a number nor a list of one number per seed")
     finite = [None if number is None or not math.isfinite(number) else number for number in numbers]
     return finite if isinstance(plain, list) else finite[0]
 
 
 def _rows(path: Path) -> Iterator[tuple[bytes, dict[str, Any]]]:
     if not path.is_file():
-        raise MetricsError(f"{path} does not exist or is not a regular file; check the path")
-    with attempting("read", path, MetricsError), open_regular(path) as file:
+        raise UserError(f"{path} does not exist or is not a regular file; check the path")
+    with attempting("read", path), open_regular(path) as file:
         for number in itertools.count(1):
             line = file.readline(_MAX_LINE_BYTES)
             row = _parse(line)
             if row is not None:
                 yield line.removesuffix(b"\n"), row
             elif line.endswith(b"\n") or len(line) == _MAX_LINE_BYTES:
-                raise MetricsError(f"{path} is damaged: line {number} is not a row of metrics; remove that line")
+                raise UserError(f"{path} is damaged: line {number} is not a row of metrics; remove that line")
             else:  # the end, or a line that a killed process had not finished
                 return
 
