@@ -30,7 +30,7 @@ from esp_cli.networks.contract import NetworkConfig
 from esp_cli.policies.evaluation import FinalEvaluation
 from esp_cli.policies.evaluation import evaluate as evaluate_policy
 from esp_cli.policies.loaded import LoadedPolicy, register_own
-from esp_cli.policies.loading import Start, TrainedPolicy
+from esp_cli.policies.loading import TrainedPolicy, weights_to_start
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config
 from esp_cli.training.metrics import Metrics, read_last_row, read_metrics
@@ -193,7 +193,7 @@ def plan(
     learner = build_learner(config)
     if init_from is None:
         return config, None
-    initial, weights = Start.open(init_from).fit(learner)
+    initial, weights = weights_to_start(init_from, learner)
     return config.model_copy(update={"init_from": initial}), weights
 
 
