@@ -76,10 +76,8 @@ class DocumentFormat:
         content = self.read(path)
         try:
             return validate(model, content)
-        except ValidationError as error:
-            raise UserError(f"{path} is damaged: {one_sentence(error, model)}") from None
         except UserError as error:
-            raise UserError(f"{path}: {error}") from None
+            raise UserError(f"{path} is damaged: {error}") from None
 
     def write(self, path: str | os.PathLike[str], content: Mapping[str, Any]) -> None:
         """Write a document as a whole or not at all; a UserError says that content is no JSON (NaN) or a key taken."""
@@ -100,9 +98,12 @@ def begins_with(path: Path, text: str) -> bool:
         return text.encode() in file.read(100)
 
 
-def validate(model: type[Model], content: object) -> Model:
+def validate(model: type[Model], content: object, section: str = "") -> Model:
     """Return the validated content of a document; a value of another type is refused, not converted (true is not 1)."""
-    return model.model_validate_json(json.dumps(content), strict=True)
+    try:
+        return model.model_validate_json(json.dumps(content), strict=True)
+    except ValidationError as error:
+        raise UserError(_one_sentence(error, model, section)) from None
 
 
 def validated(model: type[BaseModel], values: Mapping[str, object], section: str, owner: str = "") -> Any:
@@ -110,7 +111,7 @@ def validated(model: type[BaseModel], values: Mapping[str, object], section: str
     try:
         built = model(**values)
     except ValidationError as error:
-        raise UserError(one_sentence(error, model, section, owner)) from None
+        raise UserError(_one_sentence(error, model, section, owner)) from None
     for name, value in values.items():
         given, taken = _numbers(value), _numbers(getattr(built, name))
         problem = ""
@@ -203,7 +204,7 @@ def _bounded(number: str) -> int:
     return value
 
 
-def one_sentence(error: ValidationError, model: type[BaseModel], section: str = "", owner: str = "") -> str:
+def _one_sentence(error: ValidationError, model: type[BaseModel], section: str, owner: str = "") -> str:
     """Say what is wrong with the first bad setting of a model, and what could stand there."""
     first = error.errors(include_url=False)[0]
     name = shortened(".".join([*([section] if section else []), *(str(part) for part in first["loc"])]))

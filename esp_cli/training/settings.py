@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
 from esp_cli.algorithms.presets import ALGORITHMS, FAST, PAPER, PRESETS, SETS, TUNED, Sections
 from esp_cli.defaults import __version__
-from esp_cli.files.documents import flat, one_sentence, read_table, validate
+from esp_cli.files.documents import flat, read_table, validate
 from esp_cli.files.formatting import did_you_mean, shortened
 from esp_cli.networks.build import NETWORKS
 from esp_cli.prior import PriorConfig
@@ -206,11 +206,11 @@ def _of_run(path: Path, config: RunConfig) -> ConfigFile:
 def parse_config(data: object, source: Path, writer: object = __version__) -> RunConfig:
     """Validate a configuration that a run folder or file holds, as JSON gave it and a version of esp wrote it."""
     try:
-        config = validate(RunConfig, data)
-    except ValidationError as error:
+        config = validate(RunConfig, data, "config")
+    except UserError as error:
         # Another version may have had another name for a setting; of one version that is damage.
         other = "" if writer == __version__ else f" (written by esp {str(writer)[:20]}, this is {__version__})"
-        raise UserError(f"{source}: {one_sentence(error, RunConfig, 'config')}{other}") from None
+        raise UserError(f"{source}: {error}{other}") from None
     try:
         return completed(config)
     except UserError as error:
