@@ -82,13 +82,6 @@ def replace_file(path: str | os.PathLike[str], content: bytes) -> None:
             os.close(entries)
 
 
-def sync_file(path: Path) -> None:
-    """Flush what was appended to a file, if it is there, to the disk."""
-    if path.exists():
-        with path.open("rb+") as file:
-            os.fsync(file.fileno())
-
-
 def write_all(descriptor: int, content: bytes) -> None:
     """Write every byte; a disk about to be full takes a part only, and the rest then says so."""
     rest = memoryview(content)

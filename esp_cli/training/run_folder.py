@@ -30,7 +30,7 @@ from torch import Tensor
 from esp_cli.files.documents import DocumentFormat
 from esp_cli.files.formatting import attempting
 from esp_cli.files.opening import holding, open_own
-from esp_cli.files.writing import TEMPORARY_PREFIX, sync_file
+from esp_cli.files.writing import TEMPORARY_PREFIX
 from esp_cli.training.checkpoint import (
     CHECKPOINT_FORMAT,
     POLICY_FORMAT,
@@ -138,7 +138,9 @@ class RunFolder:
         path = self.checkpoint_path(step, final)
         with attempting("write", path):
             path.parent.mkdir(exist_ok=True)
-            sync_file(self.metrics_path)
+            if self.metrics_path.exists():
+                with self.metrics_path.open("rb+") as metrics:
+                    os.fsync(metrics.fileno())
         stamp = {RUN_ID: self.identity, CONFIG_SHA256: self._config_sha256}
         save_checkpoint(path, tensors, {**meta, **stamp, "step": step})
         regular, finals, past = list[Path](), list[Path](), list[Path]()
