@@ -37,10 +37,6 @@ _MAX_LINE_BYTES = 16 * 2**20  # what is longer was not written by this program
 _TAIL_BYTES = 2**18  # longer than most lines
 
 
-class NoMetricError(UserError):
-    """No row has a metric."""
-
-
 class MetricsWriter:
     """Appends rows to a JSONL file that `truncate_metrics` has mended, and hands each to trackers, closed with it."""
 
@@ -106,7 +102,7 @@ def truncate_metrics(path: str | os.PathLike[str], last_step: int) -> None:
 
 
 def column(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the steps [K] and values [K, S] of one metric in the rows of a run, or raise NoMetricError.
+    """Return the steps [K] and values [K, S] of one metric in the rows of a run; a UserError says that there is none.
 
     Rows without it are left out, ``null`` is NaN, a bare number is a value of one seed.
     """
@@ -115,7 +111,7 @@ def column(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[NDArray[np.int
         names = sorted({key for row in rows for key in row if key != "step"})
         near = difflib.get_close_matches(name, names, 3, 0.4) or names[:3]
         hint = f"; there is {', '.join(near)}" if near else ", and no other metric either"
-        raise NoMetricError(f"no row has the metric '{name}'{hint}")
+        raise UserError(f"no row has the metric '{name}'{hint}")
     lists = [value if isinstance(value, list) else [value] for _, value in found]
     if len({len(numbers) for numbers in lists}) > 1:
         raise UserError(f"the rows of '{name}' differ in the number of seeds")
@@ -146,16 +142,12 @@ class Metrics(Shown, dict[str, Floats]):
     def __init__(self, rows: Sequence[Mapping[str, Any]], seeds: Sequence[int]) -> None:
         self.seeds = tuple(seeds)
         self.steps: NDArray[np.int64] = np.array([row["step"] for row in rows], dtype=np.int64)
-        self._whole: set[str] = set()
-        for index, row in enumerate(rows):
-            for name, value in row.items():
-                if name == "step":
-                    continue
-                if name not in self:
-                    columns = len(self.seeds) if isinstance(value, list) else 1
-                    self._whole |= set() if isinstance(value, list) else {name}
-                    self[name] = np.full((len(rows), columns), math.nan)
-                self[name][index] = np.array(value, dtype=np.float64)
+        kinds = {name: type(value) for row in rows for name, value in row.items() if name != "step"}
+        self._whole = {name for name, kind in kinds.items() if kind is not list}
+        for name in kinds:
+            _, values = column(rows, name)
+            self[name] = np.full((len(rows), values.shape[1]), math.nan)
+            self[name][[name in row for row in rows]] = values
 
     def _facts(self) -> Mapping[str, object]:
         """Return what there is, and the newest mean over seeds of what was evaluated."""
