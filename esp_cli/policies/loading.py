@@ -95,9 +95,7 @@ class TrainedPolicy:
                 f"{self.source} was trained with other {part} than the task has with {names} "
                 f"changed; change only what a policy neither sees nor does{known}"
             )
-        if spec.observation == self.spec.observation and not numbers:
-            return replace(self, config=config, spec=spec)
-        policy = _untrained(config, spec).to(config.device)
+        policy = _untrained(config, spec)
         policy.load_state_dict(self.policy.state_dict())
         return replace(self, config=config, spec=spec, policy=policy)
 
@@ -194,7 +192,8 @@ def weights_to_start(source: str | os.PathLike[str], learner: Learner) -> tuple[
 
 def _untrained(config: RunConfig, spec: TaskSpec) -> Policy:
     network = _at_default(config.network, "compiled")  # using a policy needs no compiler
-    return new_policy(ALGORITHMS[config.algorithm], spec, network, generators(config.seeds, "shape")).eval()
+    policy = new_policy(ALGORITHMS[config.algorithm], spec, network, generators(config.seeds, "shape"))
+    return policy.to(config.device).eval()
 
 
 def _at_default(network: NetworkConfig, *names: str) -> NetworkConfig:
@@ -225,7 +224,7 @@ def _build(
     needed = len(config.seeds) * config.network.least_parameters(spec.observation.width)
     if needed > sum(tensor.numel() for tensor in tensors.values()):
         raise UserError(f"{misfit} (hidden widths {config.network.hidden})")
-    policy = _untrained(config, spec).to(config.device)
+    policy = _untrained(config, spec)
     _fill(policy, tensors, path, misfit)
     if stopped := _stopped(meta, len(config.seeds)):
         seeds = ", ".join(str(config.seeds[k]) for k in stopped)
