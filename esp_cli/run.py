@@ -30,11 +30,11 @@ from esp_cli.networks.contract import NetworkConfig
 from esp_cli.policies.evaluation import FinalEvaluation
 from esp_cli.policies.evaluation import evaluate as evaluate_policy
 from esp_cli.policies.loaded import LoadedPolicy, register_own
-from esp_cli.policies.loading import Start, TrainedPolicy
+from esp_cli.policies.loading import TrainedPolicy, weights_to_start
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import RunConfig, resolve_config
 from esp_cli.training.metrics import Metrics, read_last_row, read_metrics
-from esp_cli.training.run_folder import RunFolder, RunFolderError
+from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.settings import parse_config
 from esp_cli.training.trackers import require
 from esp_cli.training.trainer import Listener, Trainer
@@ -193,7 +193,7 @@ def plan(
     learner = build_learner(config)
     if init_from is None:
         return config, None
-    initial, weights = Start.open(init_from).fit(learner)
+    initial, weights = weights_to_start(init_from, learner)
     return config.model_copy(update={"init_from": initial}), weights
 
 
@@ -204,11 +204,12 @@ def begin(config: RunConfig, weights: Mapping[str, Tensor] | None, out: str | os
     numbered = (first.with_name(f"{first.name}-{k}") for k in itertools.count(2))
     path = next(path for path in itertools.chain([first], numbered) if not path.exists()) if out is None else Path(out)
     try:
-        return Run(RunFolder.create(path, config.model_dump(mode="json"), initial=weights).path)
-    except RunFolderError:
+        folder = RunFolder.create(path, config.model_dump(mode="json"), initial=weights)
+    except UserError:
         if out is not None or not path.exists():
             raise
         return begin(config, weights, None)  # another program took the name meanwhile
+    return Run(folder.path)
 
 
 def train(

@@ -103,13 +103,12 @@ class LiveCurves(StudyProgress):
 def _curve(run: Path) -> list[tuple[int, float]]:
     """Return the steps of a run's evaluations, and the mean of their greedy returns over the seeds."""
     from esp_cli.training.folder_names import METRICS
-    from esp_cli.training.metrics import NoMetricError, column, read_metrics
+    from esp_cli.training.metrics import column, read_metrics
 
-    path = run / METRICS
-    try:
-        steps, returns = column(read_metrics(path) if path.exists() else [], "eval/return_greedy")
-    except NoMetricError:  # before the first
+    rows = read_metrics(run / METRICS) if (run / METRICS).exists() else []
+    if not any("eval/return_greedy" in row for row in rows):  # before the first
         return []
+    steps, returns = column(rows, "eval/return_greedy")
     return list(zip(steps.tolist(), returns.mean(1).tolist(), strict=True))
 
 

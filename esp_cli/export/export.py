@@ -20,7 +20,6 @@ from esp_cli.export.onnx_file import onnx_model, onnx_runner
 from esp_cli.export.program import Program, program_of
 from esp_cli.export.templates import RUNTIME, filled
 from esp_cli.export.torch_file import torch_archive, torch_runner
-from esp_cli.files.documents import DocumentError
 from esp_cli.files.writing import replace_file
 from esp_cli.policies.loading import TrainedPolicy
 from esp_envs.errors import UserError
@@ -167,7 +166,7 @@ def _exported(folder: Path) -> set[str]:
     """Return the files that an export wrote into a folder, by its own description; none where there is none."""
     try:
         told = EXPORT.read(folder / DESCRIPTION).get("formats")
-    except DocumentError:
+    except UserError:
         return set()
     return {file for name, known in FORMATS.items() if isinstance(told, list) and name in told for file in known.files}
 

@@ -42,10 +42,6 @@ class Strict(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class DocumentError(UserError):
-    """A document cannot be read or written; the text is one sentence for the user."""
-
-
 @dataclass(frozen=True)
 class DocumentFormat:
     """A kind of JSON document: an object with the keys ``format`` and ``version`` beside its content."""
@@ -53,23 +49,22 @@ class DocumentFormat:
     name: str  # value of ``format``
     version: int  # newest value of ``version`` that this program reads
     noun: str  # what it is for people, such as "the configuration of a run"
-    error: type[UserError] = DocumentError  # kind of exception for what the user can correct
 
     def read(self, path: str | os.PathLike[str]) -> dict[str, Any]:
-        """Return the content without ``format`` and ``version``; a document that is wrong is of the kind `error`."""
-        with attempting("read", path, self.error):
+        """Return the content without ``format`` and ``version``; a document that is wrong is a UserError."""
+        with attempting("read", path):
             text = read_regular(path, MAX_DOCUMENT_BYTES)
         if text is None:
-            raise self.error(f"{path} is foreign: it is larger than {self.noun} can be")
+            raise UserError(f"{path} is foreign: it is larger than {self.noun} can be")
         try:
             document = parse_object(text, "text")
-        except DocumentError as error:
-            raise self.error(f"{path} {error}") from None
+        except UserError as error:
+            raise UserError(f"{path} {error}") from None
         version = document.pop("version", None)
         if document.pop("format", None) != self.name or type(version) is not int:
-            raise self.error(f"{path} is foreign: it is not {self.noun} of esp")
+            raise UserError(f"{path} is foreign: it is not {self.noun} of esp")
         if version > self.version:
-            raise self.error(f"{path} was written by a newer esp; update esp to use it")
+            raise UserError(f"{path} was written by a newer esp; update esp to use it")
         return document
 
     def is_one(self, path: Path) -> bool:
@@ -81,16 +76,14 @@ class DocumentFormat:
         content = self.read(path)
         try:
             return validate(model, content)
-        except ValidationError as error:
-            raise self.error(f"{path} is damaged: {one_sentence(error, model)}") from None
         except UserError as error:
-            raise self.error(f"{path}: {error}") from None
+            raise UserError(f"{path} is damaged: {error}") from None
 
     def write(self, path: str | os.PathLike[str], content: Mapping[str, Any]) -> None:
-        """Write a document as a whole or not at all; `error` says that content is no JSON (NaN) or a key taken."""
+        """Write a document as a whole or not at all; a UserError says that content is no JSON (NaN) or a key taken."""
         if "format" in content or "version" in content:
-            raise self.error(f"cannot write {path}: its content may not use the keys 'format' and 'version'")
-        replace_file(path, encode(self.document(content), path, self.error))
+            raise UserError(f"cannot write {path}: its content may not use the keys 'format' and 'version'")
+        replace_file(path, encode(self.document(content), path))
 
     def document(self, content: Mapping[str, Any]) -> dict[str, Any]:
         """Return content with the keys that say what it is."""
@@ -105,9 +98,12 @@ def begins_with(path: Path, text: str) -> bool:
         return text.encode() in file.read(100)
 
 
-def validate(model: type[Model], content: object) -> Model:
+def validate(model: type[Model], content: object, section: str = "") -> Model:
     """Return the validated content of a document; a value of another type is refused, not converted (true is not 1)."""
-    return model.model_validate_json(json.dumps(content), strict=True)
+    try:
+        return model.model_validate_json(json.dumps(content), strict=True)
+    except ValidationError as error:
+        raise UserError(_one_sentence(error, model, section)) from None
 
 
 def validated(model: type[BaseModel], values: Mapping[str, object], section: str, owner: str = "") -> Any:
@@ -115,7 +111,7 @@ def validated(model: type[BaseModel], values: Mapping[str, object], section: str
     try:
         built = model(**values)
     except ValidationError as error:
-        raise UserError(one_sentence(error, model, section, owner)) from None
+        raise UserError(_one_sentence(error, model, section, owner)) from None
     for name, value in values.items():
         given, taken = _numbers(value), _numbers(getattr(built, name))
         problem = ""
@@ -145,12 +141,12 @@ def without_gone(owner: str, stored: object) -> object:
     return {name: value for name, value in stored.items() if name not in gone}
 
 
-def encode(value: object, path: str | os.PathLike[str], error: type[UserError] = DocumentError) -> bytes:
-    """Return a value as indented JSON; what is not JSON, as NaN and infinity, raises an error of this kind."""
+def encode(value: object, path: str | os.PathLike[str]) -> bytes:
+    """Return a value as indented JSON; what is not JSON, as NaN and infinity, is a UserError."""
     try:
         return (json.dumps(value, indent=2, allow_nan=False, ensure_ascii=False) + "\n").encode()
-    except (TypeError, ValueError, RecursionError) as failure:
-        raise error(f"cannot write {path}: its content is not JSON ({failure})") from None
+    except (TypeError, ValueError, RecursionError) as error:
+        raise UserError(f"cannot write {path}: its content is not JSON ({error})") from None
 
 
 def parse_object(text: bytes | str, noun: str) -> dict[str, Any]:
@@ -158,9 +154,9 @@ def parse_object(text: bytes | str, noun: str) -> dict[str, Any]:
     try:
         value = parse_value(text.decode("utf-8") if isinstance(text, bytes) else text)
     except ValueError as error:
-        raise DocumentError(f"is damaged or foreign: its {noun} is not valid JSON ({shortened(str(error))})") from None
+        raise UserError(f"is damaged or foreign: its {noun} is not valid JSON ({shortened(str(error))})") from None
     if not isinstance(value, dict):
-        raise DocumentError(f"is damaged or foreign: its {noun} is no JSON object")
+        raise UserError(f"is damaged or foreign: its {noun} is no JSON object")
     return value
 
 
@@ -208,7 +204,7 @@ def _bounded(number: str) -> int:
     return value
 
 
-def one_sentence(error: ValidationError, model: type[BaseModel], section: str = "", owner: str = "") -> str:
+def _one_sentence(error: ValidationError, model: type[BaseModel], section: str, owner: str = "") -> str:
     """Say what is wrong with the first bad setting of a model, and what could stand there."""
     first = error.errors(include_url=False)[0]
     name = shortened(".".join([*([section] if section else []), *(str(part) for part in first["loc"])]))
@@ -227,26 +223,26 @@ def one_sentence(error: ValidationError, model: type[BaseModel], section: str = 
 
 
 def read_table(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read a file that a person wrote: one JSON object, or TOML where its name ends in .toml; else a DocumentError."""
-    with attempting("read", path, DocumentError):
+    """Read a file that a person wrote: one JSON object, or TOML where its name ends in .toml; else a UserError."""
+    with attempting("read", path):
         text = read_regular(path, MAX_TABLE_BYTES)
     if text is None:
-        raise DocumentError(f"{path} is larger than a file of settings can be")
+        raise UserError(f"{path} is larger than a file of settings can be")
     if Path(path).suffix.lower() != ".toml":
         try:
             return parse_object(text, "text")
-        except DocumentError as error:
-            raise DocumentError(f"{path} {error}; write TOML into a file whose name ends in .toml") from None
+        except UserError as error:
+            raise UserError(f"{path} {error}; write TOML into a file whose name ends in .toml") from None
     try:
         table = tomllib.loads(text.decode("utf-8"))
         _refuse_nesting(table)
     except (ValueError, RecursionError) as error:
-        raise DocumentError(f"{path} is not valid TOML: {shortened(str(error))}") from None
+        raise UserError(f"{path} is not valid TOML: {shortened(str(error))}") from None
     for name, value in flat(table):
         if isinstance(value, float) and not math.isfinite(value):
-            raise DocumentError(f"{path} sets '{name}' to {value}; write a finite number")
+            raise UserError(f"{path} sets '{name}' to {value}; write a finite number")
         if not isinstance(value, bool | int | float | str | list):
-            raise DocumentError(f"{path} sets '{name}' to a date or time; write a number, a text or a list")
+            raise UserError(f"{path} sets '{name}' to a date or time; write a number, a text or a list")
     return table
 
 

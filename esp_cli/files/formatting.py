@@ -154,14 +154,14 @@ def own_words(message: str) -> str:
 
 
 @contextlib.contextmanager
-def attempting(verb: str, path: str | os.PathLike[str], kind: type[UserError]) -> Iterator[None]:
+def attempting(verb: str, path: str | os.PathLike[str]) -> Iterator[None]:
     """Turn a failure to do something ("write", "make the run folder") with a path into one sentence.
 
-    It is of the kind where the user can correct it, else, of a full or read-only disk, an OSError that names the path.
+    It is a UserError where the user can correct it, else, of a full or read-only disk, an OSError that names the path.
     """
     try:
         yield
     except OSError as error:
         if is_correctable(error):
-            raise kind(f"cannot {verb} {os.fspath(path)}: {error.strerror or error}") from None
+            raise UserError(f"cannot {verb} {os.fspath(path)}: {error.strerror or error}") from None
         raise OSError(error.errno, error.strerror, os.fspath(path)) from None

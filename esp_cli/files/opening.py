@@ -17,27 +17,23 @@ from esp_cli.files.formatting import attempting
 from esp_envs.errors import UserError
 
 
-class LockError(UserError):
-    """Another process holds the folder, or it cannot be locked; the text is one sentence for the user."""
-
-
 @contextmanager
-def holding(file: Path, kind: type[UserError] = LockError) -> Iterator[None]:
+def holding(file: Path) -> Iterator[None]:
     """Hold the folder of a lock file, and write into the file who holds it.
 
     The kernel lets go when the process ends, however it ends. The file stays: removing it would let two processes hold
-    two files of one name. An error of the `kind` says that another process, or this one, holds it already, or that
-    something else than a regular file is there; where the file system cannot lock, it is an OSError.
+    two files of one name. A UserError says that another process, or this one, holds it already, or that something else
+    than a regular file is there; where the file system cannot lock, it is an OSError.
     """
     with ExitStack() as undo:
-        with attempting("lock", file, kind):
+        with attempting("lock", file):
             descriptor = open_own(file, os.O_RDWR)
             undo.callback(os.close, descriptor)
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
                 holder = _holder(os.pread(descriptor, 4096, 0))
-                raise kind(f"{file.parent} is in use by {holder}; wait for it, or stop it first") from None
+                raise UserError(f"{file.parent} is in use by {holder}; wait for it, or stop it first") from None
             undo.callback(fcntl.flock, descriptor, fcntl.LOCK_UN)  # also for processes that are forked meanwhile
             owner = json.dumps({"pid": os.getpid(), "host": socket.gethostname()}) + "\n"
             # In this order, so that a process that is refused meanwhile finds a name and not an empty file.

@@ -9,18 +9,11 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import functools
 import os
 import secrets
 import stat
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from esp_cli.files.opening import open_own
-from esp_envs.errors import UserError
-
-MAX_LINE_BYTES = 16 * 2**20  # of a file of lines, such as metrics; what is longer was not written by this program
-TAIL_BYTES = 2**18  # longer than most lines
 TEMPORARY_PREFIX = ".esp-tmp-"  # of half-written files; what a killed process left under such a name may be removed
 
 
@@ -56,28 +49,7 @@ def refuse_unwritable(path: str | os.PathLike[str]) -> None:
 
 
 def replace_file(path: str | os.PathLike[str], content: bytes) -> None:
-    """Replace a file as a whole by this content; see `replacing`."""
-    with replacing(path) as write:
-        write(content)
-
-
-def mend_last_line(path: Path) -> None:
-    """Remove what a kill left behind the last line break, so that the next line does not run into it."""
-    if not path.exists():
-        return
-    with os.fdopen(open_own(path, os.O_RDWR), "rb+", buffering=0) as file:
-        size, tail = file.seek(0, os.SEEK_END), b""
-        while b"\n" not in tail and len(tail) < size:
-            if len(tail) > MAX_LINE_BYTES:
-                raise UserError(f"{path} is damaged: its last line has more than 16 MiB; remove that line")
-            start = file.seek(max(0, size - max(2 * len(tail), TAIL_BYTES)))
-            tail = file.read(size - start)
-        file.truncate(size - len(tail.rpartition(b"\n")[2]))
-
-
-@contextlib.contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[Callable[[bytes], None]]:
-    """Replace a file as a whole by content that comes in parts, each given to the function that is yielded.
+    """Replace a file as a whole by this content.
 
     The bytes go to a temporary file in the same folder, which is flushed to the disk and renamed over ``path``; then
     the folder's own entry is flushed. A link there is replaced, not followed. After an exception the file is as before.
@@ -91,7 +63,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Callable[[bytes], None]]
             with contextlib.suppress(OSError):  # a new file, or one of somebody else
                 if stat.S_ISREG((before := path.lstat()).st_mode):
                     os.fchmod(descriptor, before.st_mode & 0o777)
-            yield functools.partial(write_all, descriptor)
+            write_all(descriptor, content)
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
@@ -108,13 +80,6 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Callable[[bytes], None]]
             os.fsync(entries)
         finally:
             os.close(entries)
-
-
-def sync_file(path: Path) -> None:
-    """Flush what was appended to a file, if it is there, to the disk."""
-    if path.exists():
-        with path.open("rb+") as file:
-            os.fsync(file.fileno())
 
 
 def write_all(descriptor: int, content: bytes) -> None:

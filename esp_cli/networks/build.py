@@ -6,12 +6,12 @@ A network is one file, with its class and its `NetworkConfig`. The settings are 
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from typing import Annotated
 
 from pydantic import BeforeValidator, SerializeAsAny
 
-from esp_cli.files.documents import validate
 from esp_cli.networks.contract import ActivationName, Generators, IoSpec, Network, NetworkConfig
 from esp_cli.networks.plain import MlpConfig, PlainConfig
 from esp_cli.networks.symmetrised import LOCAL, LocalFrame, Symmetrised
@@ -55,7 +55,7 @@ def _stored(data: object) -> object:
     kept = {name: value for name, value in data.items() if name not in excess}
     if "compiled" in cls.model_fields:  # a run of before there was a choice computed without kernels
         kept.setdefault("compiled", False)
-    return validate(cls, kept)
+    return cls.model_validate_json(json.dumps(kept), strict=True)
 
 
 # A field of a pydantic model that holds the settings of any registered network

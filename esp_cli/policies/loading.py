@@ -95,9 +95,7 @@ class TrainedPolicy:
                 f"{self.source} was trained with other {part} than the task has with {names} "
                 f"changed; change only what a policy neither sees nor does{known}"
             )
-        if spec.observation == self.spec.observation and not numbers:
-            return replace(self, config=config, spec=spec)
-        policy = _untrained(config, spec).to(config.device)
+        policy = _untrained(config, spec)
         policy.load_state_dict(self.policy.state_dict())
         return replace(self, config=config, spec=spec, policy=policy)
 
@@ -157,58 +155,45 @@ def open_policy(where: Path, algo: str | None = None, prior: str | None = None) 
     raise UserError(f"{where} does not exist{hint}")
 
 
-@dataclass(frozen=True)
-class Start:
-    """Weights that a run may start from: those of a policy, and where a network is free of counts all that fits."""
+def weights_to_start(source: str | os.PathLike[str], learner: Learner) -> tuple[InitialPolicy, dict[str, Tensor]]:
+    """Return what a new run's configuration records of the policy it starts from, and weights [S, ...] for its learner.
 
-    source: str  # the policy, as a configuration records it
-    holder: Path  # the file or folder that holds the weights
-    config: RunConfig  # of the run that trained the policy, or that started from it
-    weights: Mapping[str, Tensor]  # [S', ...]; one seed's serve all, as many seeds as a new run has serve one each
-
-    @classmethod
-    def open(cls, source: str | os.PathLike[str]) -> Start:
-        trained = open_policy(Path(source))
-        weights = {**trained.policy.state_dict(), **trained.further}
-        return cls(os.fspath(source), trained.source, trained.config, weights)
-
-    def fit(self, learner: Learner) -> tuple[InitialPolicy, dict[str, Tensor]]:
-        """Return what a new run's configuration records of this start, and the weights [S, ...] for its learner."""
-        seeds, own, given = learner.policy.num_seeds, learner.policy.state_dict(), dict(self.weights)
-        fitting: dict[str, Tensor] = {}
-        for name, tensors in learner.further_weights().items():
-            theirs = {key: given.pop(key) for key in [*given] if key.startswith(f"{name}.")}
-            if {key: t.shape[1:] for key, t in theirs.items()} == {key: t.shape[1:] for key, t in tensors.items()}:
-                fitting |= theirs
-        if self._num_seeds not in (1, seeds):
+    They are those of the policy, and where a network is free of counts all that fits. One seed's serve all seeds; as
+    many seeds as the new run has serve one each.
+    """
+    trained = open_policy(Path(source))
+    config, held, seeds = trained.config, trained.policy.num_seeds, learner.policy.num_seeds
+    own, given = learner.policy.state_dict(), {**trained.policy.state_dict(), **trained.further}
+    fitting: dict[str, Tensor] = {}
+    for name, tensors in learner.further_weights().items():
+        theirs = {key: given.pop(key) for key in [*given] if key.startswith(f"{name}.")}
+        if {key: t.shape[1:] for key, t in theirs.items()} == {key: t.shape[1:] for key, t in tensors.items()}:
+            fitting |= theirs
+    if held not in (1, seeds):
+        raise UserError(
+            f"cannot start {seeds} seed(s) from {trained.source}, which holds {held}; train {held} seeds, or start "
+            "from a policy of one seed"
+        )
+    # names before shapes: those that differ are of another algorithm or network
+    for name in [*sorted(own.keys() ^ given.keys()), *sorted(own.keys() & given.keys())]:
+        here, there = (list(side[name].shape[1:]) if name in side else None for side in (own, given))
+        if here != there:
+            of_it = f"'{name}' is {'missing' if there is None else there} there"
+            of_this = "missing" if here is None else here
+            algorithm = "the algorithm, " if here is None or there is None else ""
             raise UserError(
-                f"cannot start {seeds} seed(s) from {self.holder}, which holds {self._num_seeds}; train "
-                f"{self._num_seeds} seeds, or start from a policy of one seed"
+                f"cannot start from {trained.source}: it is a policy of {config.algorithm} on {config.task} with the "
+                f"network {config.network.name}, and {of_it} but {of_this} in this run; choose {algorithm}the task "
+                "settings and the network of that policy"
             )
-        # names before shapes: those that differ are of another algorithm or network
-        for name in [*sorted(own.keys() ^ given.keys()), *sorted(own.keys() & given.keys())]:
-            here, there = (list(side[name].shape[1:]) if name in side else None for side in (own, given))
-            if here != there:
-                of_it = f"'{name}' is {'missing' if there is None else there} there"
-                of_this = "missing" if here is None else here
-                algorithm = "the algorithm, " if here is None or there is None else ""
-                raise UserError(
-                    f"cannot start from {self.holder}: it is a policy of {self.config.algorithm} on {self.config.task} "
-                    f"with the network {self.config.network.name}, and {of_it} but {of_this} in this run; "
-                    f"choose {algorithm}the task settings and the network of that policy"
-                )
-        every = {**given, **fitting}
-        weights = {name: t.cpu().expand(seeds, *t.shape[1:]).contiguous() for name, t in every.items()}
-        return InitialPolicy(source=self.source, sha256=digest(weights, {})), weights
-
-    @property
-    def _num_seeds(self) -> int:
-        return len(next(iter(self.weights.values())))
+    weights = {name: t.cpu().expand(seeds, *t.shape[1:]).contiguous() for name, t in {**given, **fitting}.items()}
+    return InitialPolicy(source=os.fspath(source), sha256=digest(weights, {})), weights
 
 
 def _untrained(config: RunConfig, spec: TaskSpec) -> Policy:
     network = _at_default(config.network, "compiled")  # using a policy needs no compiler
-    return new_policy(ALGORITHMS[config.algorithm], spec, network, generators(config.seeds, "shape")).eval()
+    policy = new_policy(ALGORITHMS[config.algorithm], spec, network, generators(config.seeds, "shape"))
+    return policy.to(config.device).eval()
 
 
 def _at_default(network: NetworkConfig, *names: str) -> NetworkConfig:
@@ -239,7 +224,7 @@ def _build(
     needed = len(config.seeds) * config.network.least_parameters(spec.observation.width)
     if needed > sum(tensor.numel() for tensor in tensors.values()):
         raise UserError(f"{misfit} (hidden widths {config.network.hidden})")
-    policy = _untrained(config, spec).to(config.device)
+    policy = _untrained(config, spec)
     _fill(policy, tensors, path, misfit)
     if stopped := _stopped(meta, len(config.seeds)):
         seeds = ", ".join(str(config.seeds[k]) for k in stopped)

@@ -25,7 +25,7 @@ from esp_cli.studies.study import StudyFolder, read_evaluation
 from esp_cli.training.build import spec_of
 from esp_cli.training.config import RunConfig
 from esp_cli.training.folder_names import METRICS
-from esp_cli.training.metrics import MetricsError, NoMetricError, column, elapsed_s, read_metrics
+from esp_cli.training.metrics import column, elapsed_s, read_metrics
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.settings import parse_config
 from esp_envs.errors import UserError
@@ -78,8 +78,8 @@ def read_curve(path: Path, label: str | None, mode: Mode) -> RunCurve:
 def _curve(rows: Sequence[Mapping[str, Any]], mode: Mode, run: Path, label: str, config: RunConfig) -> RunCurve:
     try:
         steps, values = column(rows, f"eval/return_{mode}")
-    except MetricsError as error:
-        raise type(error)(f"{run / METRICS}: {error}") from None
+    except UserError as error:
+        raise UserError(f"{run / METRICS}: {error}") from None
     if values.shape[1] != len(config.seeds):
         raise UserError(
             f"{run} is damaged: its metrics have {values.shape[1]} seeds, its configuration {len(config.seeds)}"
@@ -217,10 +217,8 @@ def _state(folder: StudyFolder, cell: Cell, mode: Mode) -> _State:
         wanted = len(cell.config.seeds)
         if any(len(returns.per_seed) != wanted for returns in (final.greedy, final.stochastic)):
             raise UserError(f"{run} does not fit its study: its final evaluation has not the {wanted} seeds of the run")
-    try:
-        curve = _curve(rows, mode, run, cell.variant, cell.config)
-    except NoMetricError:  # it has only begun
-        curve = None
+    begun = any(f"eval/return_{mode}" in row for row in rows)
+    curve = _curve(rows, mode, run, cell.variant, cell.config) if begun else None
     return _State(rows[-1]["step"] if rows else 0, curve, final)
 
 

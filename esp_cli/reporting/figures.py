@@ -24,7 +24,6 @@ from esp_cli.drawing.figures import PAPER, PAPER_DPI, STEADY, saved
 from esp_cli.files.formatting import attempting, format_span
 from esp_cli.files.writing import write_file
 from esp_cli.policies.statistics import bootstrap_interval, mean_and_sem
-from esp_envs.errors import UserError
 from esp_envs.scene import COLORS
 
 LineStyle = str | tuple[int, tuple[int, ...]]
@@ -171,7 +170,7 @@ def written_figure(
         yield figure, Picture(png, svg, (size[0] * POINTS_PER_INCH, size[1] * POINTS_PER_INCH))
         for file in (png, svg, *([png.with_suffix(".pdf")] if for_print else [])):
             content = saved(figure, file.suffix[1:])
-            with attempting("write the figure", file, UserError):
+            with attempting("write the figure", file):
                 write_file(file, content)
 
 

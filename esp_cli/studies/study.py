@@ -19,9 +19,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Self
 
-from pydantic import ValidationError
-
-from esp_cli.files.documents import MAX_DOCUMENT_BYTES, DocumentError, parse_object, validate
+from esp_cli.files.documents import MAX_DOCUMENT_BYTES, parse_object, validate
 from esp_cli.files.formatting import shortened
 from esp_cli.files.opening import holding, is_held, open_own, read_regular
 from esp_cli.files.writing import TEMPORARY_PREFIX
@@ -260,7 +258,7 @@ class StudyFolder:
 
 def read_evaluation(run: Path) -> FinalEvaluation | None:
     """Read the final evaluation of the trained policy in a run folder; None where there is none, or half of one."""
-    with contextlib.suppress(OSError, DocumentError, ValidationError):
+    with contextlib.suppress(OSError, UserError):
         text = read_regular(run / FINAL, MAX_DOCUMENT_BYTES) or b""
         return validate(FinalEvaluation, parse_object(text, "text"))
     return None

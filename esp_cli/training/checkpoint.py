@@ -2,7 +2,7 @@
 
 Loading never runs code, and trusts nothing. The header is checked against the size of the file before anything is
 parsed or allocated, and a SHA-256 over description and tensors is verified. So a flipped bit, a truncated copy or a
-hostile file ends in one `CheckpointError`.
+hostile file ends in one `UserError`.
 
 Layout: the safetensors metadata has the key ``esp``, whose text is a JSON object with ``format``, ``version``,
 ``sha256`` and, beside these three, the writer's own description.
@@ -26,7 +26,7 @@ from safetensors import torch as safetensors_torch
 from torch import Tensor
 
 from esp_cli.defaults import __version__
-from esp_cli.files.documents import DocumentError, parse_object
+from esp_cli.files.documents import parse_object
 from esp_cli.files.formatting import attempting, shortened
 from esp_cli.files.opening import open_regular
 from esp_cli.files.writing import replace_file
@@ -48,10 +48,6 @@ _DTYPES = {
 }
 
 
-class CheckpointError(UserError):
-    """A checkpoint or policy file cannot be written or read; the text is one sentence for the user."""
-
-
 def save_checkpoint(
     path: str | os.PathLike[str],
     tensors: Mapping[str, Tensor],
@@ -65,8 +61,8 @@ def save_checkpoint(
     described["sha256"] = digest(stored, described)
     content = safetensors_torch.save(stored, metadata={METADATA_KEY: json.dumps(described, allow_nan=False)})
     if struct.unpack_from("<Q", content)[0] > _MAX_HEADER_BYTES or len(content) > _MAX_FILE_BYTES:
-        raise CheckpointError(f"cannot write {path}: its description or its tensors are larger than a reader accepts")
-    with attempting("write", path, CheckpointError):
+        raise UserError(f"cannot write {path}: its description or its tensors are larger than a reader accepts")
+    with attempting("write", path):
         replace_file(path, content)
 
 
@@ -77,15 +73,15 @@ def load_checkpoint(
     with _naming(path):
         header, content = _read(Path(path))
         if sha256 is not None and hashlib.sha256(content).hexdigest() != sha256:
-            raise CheckpointError("is not the file that its manifest names: their SHA-256 differ; get both anew")
+            raise UserError("is not the file that its manifest names: their SHA-256 differ; get both anew")
         description = _description(header, format_name)
         try:
             tensors = safetensors_torch.load(content)  # checks that they fill the data exactly: no gap, no overlap
         except (SafetensorError, ValueError, RuntimeError, AssertionError) as error:
-            raise CheckpointError(f"is truncated or damaged: {shortened(str(error))}") from None
+            raise UserError(f"is truncated or damaged: {shortened(str(error))}") from None
         _check_tensors(tensors)
         if digest(tensors, {k: v for k, v in description.items() if k != "sha256"}) != description["sha256"]:
-            raise CheckpointError("is damaged: its content does not match its checksum; use another copy of it")
+            raise UserError("is damaged: its content does not match its checksum; use another copy of it")
     # Copies, since the loader's tensors are not aligned to 64 bytes as torch's own are; only now, since the copy of a
     # damaged truth value is a sound one.
     aligned = {name: tensor.clone() for name, tensor in tensors.items()}
@@ -102,10 +98,10 @@ def read_description(path: str | os.PathLike[str], format_name: str = CHECKPOINT
 def _naming(path: str | os.PathLike[str]) -> Iterator[None]:
     try:
         yield
-    except (CheckpointError, DocumentError) as error:
-        raise CheckpointError(f"{path} {error}") from None
+    except UserError as error:
+        raise UserError(f"{path} {error}") from None
     except OSError as error:
-        raise CheckpointError(f"{path} cannot be read: {error.strerror or error}") from None
+        raise UserError(f"{path} cannot be read: {error.strerror or error}") from None
 
 
 def _storable(path: str | os.PathLike[str], tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -114,7 +110,7 @@ def _storable(path: str | os.PathLike[str], tensors: Mapping[str, Tensor]) -> di
     for name, tensor in tensors.items():
         if not isinstance(tensor, Tensor) or tensor.layout != torch.strided or not _is_readable(tensor):
             found = getattr(tensor, "dtype", type(tensor).__name__)
-            raise CheckpointError(
+            raise UserError(
                 f"cannot write {path}: '{name}' is no dense tensor of a storable dtype and at most {_MAX_DIMENSIONS} "
                 f"dimensions ({found})"
             )
@@ -133,26 +129,26 @@ def _is_readable(tensor: Tensor) -> bool:
 def _read(path: Path, whole: bool = True) -> tuple[dict[str, Any], bytes]:
     """Return the parsed header of a plain file, and its bytes, after checking that it has the size that it declares."""
     if not path.is_file():
-        raise CheckpointError("is a folder, not a file" if path.is_dir() else "does not exist or is no plain file")
+        raise UserError("is a folder, not a file" if path.is_dir() else "does not exist or is no plain file")
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
         prefix = file.read(_LENGTH_BYTES)
         if len(prefix) < _LENGTH_BYTES:
-            raise CheckpointError(f"is no safetensors file: it has only {len(prefix)} bytes")
+            raise UserError(f"is no safetensors file: it has only {len(prefix)} bytes")
         (header_bytes,) = struct.unpack("<Q", prefix)
         if header_bytes > min(size - _LENGTH_BYTES, _MAX_HEADER_BYTES):
-            raise CheckpointError("is truncated or no safetensors file: the header that it declares does not fit")
+            raise UserError("is truncated or no safetensors file: the header that it declares does not fit")
         text = file.read(header_bytes)
         header = parse_object(text, "header")
         if not whole:
             return header, b""
         data_bytes = size - _LENGTH_BYTES - header_bytes
         if size > _MAX_FILE_BYTES or data_bytes != _declared_bytes(header):
-            raise CheckpointError(f"is truncated or damaged: its size, {size} bytes, is not what its header declares")
+            raise UserError(f"is truncated or damaged: its size, {size} bytes, is not what its header declares")
         try:
             return header, prefix + text + file.read(data_bytes)
         except MemoryError:
-            raise CheckpointError(f"does not fit into the memory of this machine: it has {size} bytes") from None
+            raise UserError(f"does not fit into the memory of this machine: it has {size} bytes") from None
 
 
 def _declared_bytes(header: Mapping[str, Any]) -> int:
@@ -169,27 +165,27 @@ def _description(header: Mapping[str, Any], format_name: str) -> dict[str, Any]:
     """Return the JSON object under the key ``esp`` of a file of the wanted format."""
     metadata = header.get("__metadata__")
     if not isinstance(metadata, dict) or not isinstance(metadata.get(METADATA_KEY), str):
-        raise CheckpointError(f"was not written by esp: its metadata has no '{METADATA_KEY}'")
+        raise UserError(f"was not written by esp: its metadata has no '{METADATA_KEY}'")
     description = parse_object(metadata[METADATA_KEY], "description")
     if description.get("format") != format_name:
         found = shortened(repr(description.get("format")))
         hint = "; give the run's folder" if description.get("format") == CHECKPOINT_FORMAT else ""
-        raise CheckpointError(f"is a file of the format {found}, where '{format_name}' is needed{hint}")
+        raise UserError(f"is a file of the format {found}, where '{format_name}' is needed{hint}")
     number = description.get("version")
     if type(number) is not int or number < 0 or not isinstance(description.get("sha256"), str):
-        raise CheckpointError("is damaged or foreign: it lacks a format version or a checksum")
+        raise UserError("is damaged or foreign: it lacks a format version or a checksum")
     if number > _VERSION:
-        raise CheckpointError(f"has version {number} of '{format_name}', newer than {_VERSION}; update esp")
+        raise UserError(f"has version {number} of '{format_name}', newer than {_VERSION}; update esp")
     return description
 
 
 def _check_tensors(tensors: Mapping[str, Tensor]) -> None:
     for name, tensor in tensors.items():
         if not _is_readable(tensor):
-            raise CheckpointError(f"is damaged: its tensor {shortened(repr(name))} has another dtype or rank than any")
+            raise UserError(f"is damaged: its tensor {shortened(repr(name))} has another dtype or rank than any")
         # a bool that is neither 0 nor 1 is undefined behaviour in the code that reads it
         if tensor.dtype == torch.bool and tensor.numel() and int(tensor.view(torch.uint8).max()) > 1:
-            raise CheckpointError(f"is damaged: its tensor {shortened(repr(name))} has truth values other than 0 and 1")
+            raise UserError(f"is damaged: its tensor {shortened(repr(name))} has truth values other than 0 and 1")
 
 
 def digest(tensors: Mapping[str, Tensor], description: Mapping[str, Any]) -> str:
@@ -225,5 +221,5 @@ def read_initial(path: Path, recorded: InitialPolicy) -> dict[str, Tensor]:
     """Read the weights that a run starts from, and check that they are those which its configuration records."""
     tensors, _ = load_checkpoint(path, POLICY_FORMAT)
     if digest(tensors, {}) != recorded.sha256:
-        raise CheckpointError(f"{path} does not hold the policy that the run started from; train anew")
+        raise UserError(f"{path} does not hold the policy that the run started from; train anew")
     return tensors

@@ -8,11 +8,11 @@ import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, Field, ValidationError, ValidationInfo, field_validator
+from pydantic import BaseModel, Field, ValidationInfo, field_validator
 
 from esp_cli.algorithms.presets import ALGORITHMS, preset_layers
 from esp_cli.defaults import MAX_SEEDS, MAX_STEPS, STEPS
-from esp_cli.files.documents import Strict, one_sentence, parse_value, validate, validated, without_gone
+from esp_cli.files.documents import Strict, parse_value, validate, validated, without_gone
 from esp_cli.files.formatting import nearest, shortened
 from esp_cli.networks.build import AnyNetworkConfig, network_class
 from esp_cli.networks.plain import MlpConfig
@@ -244,15 +244,9 @@ def completed(config: RunConfig) -> RunConfig:
 
     Settings that these do not have, or whose values they do not take, are a UserError.
     """
-    changes = {}
-    for part, section, model in (
-        ("task_settings", "task", task_class(config.task).Settings),
-        ("algorithm_settings", config.algorithm, ALGORITHMS[config.algorithm].config_class),
-    ):
-        try:
-            changes[part] = validate(model, getattr(config, part)).model_dump(mode="json")
-        except ValidationError as error:
-            raise UserError(one_sentence(error, model, section)) from None
+    task = validate(task_class(config.task).Settings, config.task_settings, "task")
+    learner = validate(ALGORITHMS[config.algorithm].config_class, config.algorithm_settings, config.algorithm)
+    changes = {"task_settings": task.model_dump(mode="json"), "algorithm_settings": learner.model_dump(mode="json")}
     return config.model_copy(update=changes)
 
 

@@ -2,7 +2,7 @@
 
 A row is ``{"step": 12800, "train/policy_loss": [0.1, 0.2], "time/steps_per_second": 51000.0}``: ``step`` counts env
 steps per seed, a list has one number per seed, a bare number belongs to the run as a whole. What is not finite is
-``null``. A file that is missing, damaged elsewhere than at its end, or not to be written is a MetricsError.
+``null``. A file that is missing, damaged elsewhere than at its end, or not to be written is a UserError.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from torch import Tensor
 
 from esp_cli.files.formatting import Shown, attempting
 from esp_cli.files.opening import open_own, open_regular
-from esp_cli.files.writing import MAX_LINE_BYTES, TAIL_BYTES, replacing, write_all
+from esp_cli.files.writing import replace_file, write_all
 from esp_cli.training.trackers import Guarded
 from esp_envs.errors import UserError
 
@@ -33,14 +33,8 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Value = float | None | list[float | None] | Tensor
 """What a row may hold under a name: a number, or one per seed; None where there is none, as for a stopped seed."""
-
-
-class MetricsError(UserError):
-    """A metrics file cannot be written or read; the text is one sentence for the user."""
-
-
-class NoMetricError(MetricsError):
-    """No row has a metric."""
+_MAX_LINE_BYTES = 16 * 2**20  # what is longer was not written by this program
+_TAIL_BYTES = 2**18  # longer than most lines
 
 
 class MetricsWriter:
@@ -48,7 +42,7 @@ class MetricsWriter:
 
     def __init__(self, path: str | os.PathLike[str], trackers: Sequence[Guarded] = ()) -> None:
         self._path, self._trackers = Path(path), trackers
-        with attempting("write", self._path, MetricsError):
+        with attempting("write", self._path):
             self._descriptor = open_own(self._path, os.O_WRONLY | os.O_APPEND)
 
     def __enter__(self) -> MetricsWriter:
@@ -67,12 +61,12 @@ class MetricsWriter:
         row: dict[str, Any] = {}
         for name, value in values.items():
             if name == "step":
-                raise MetricsError("'step' is the row's own column; give the metric another name")
+                raise UserError("'step' is the row's own column; give the metric another name")
             row[name] = numbers = _plain(name, value)
             if isinstance(numbers, list):
                 row[name] = [None if k in without else number for k, number in enumerate(numbers)]
         line = json.dumps({"step": int(step), **row}, allow_nan=False, separators=(",", ":")).encode() + b"\n"
-        with attempting("write", self._path, MetricsError):
+        with attempting("write", self._path):
             write_all(self._descriptor, line)
         for tracker in self._trackers:
             tracker.write(int(step), row)
@@ -86,10 +80,10 @@ def read_metrics(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
 
 def read_last_row(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Read the newest whole row of a metrics file that may be in use; empty where there is none yet."""
-    size, row = TAIL_BYTES, None
+    size, row = _TAIL_BYTES, None
     with contextlib.suppress(OSError), Path(path).open("rb") as file:
         end = start = file.seek(0, os.SEEK_END)
-        while row is None and start > 0 and size <= 2 * MAX_LINE_BYTES:
+        while row is None and start > 0 and size <= 2 * _MAX_LINE_BYTES:
             start = file.seek(max(0, end - size))
             lines = reversed(file.read().split(b"\n"))
             row = next((row for row in map(_parse, lines) if row is not None), None)
@@ -100,16 +94,15 @@ def read_last_row(path: str | os.PathLike[str]) -> dict[str, Any]:
 def truncate_metrics(path: str | os.PathLike[str], last_step: int) -> None:
     """Rewrite a metrics file, or make it, without a torn last line and the rows past the step of a checkpoint."""
     path = Path(path)
-    with attempting("write", path, MetricsError):
+    with attempting("write", path):
         os.close(open_own(path, os.O_WRONLY))
-    with attempting("write", path, MetricsError), replacing(path) as write:
-        for line, row in _rows(path):
-            if row["step"] <= last_step:
-                write(line + b"\n")
+    kept = b"".join(line + b"\n" for line, row in _rows(path) if row["step"] <= last_step)
+    with attempting("write", path):
+        replace_file(path, kept)
 
 
 def column(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the steps [K] and values [K, S] of one metric in the rows of a run, or raise NoMetricError.
+    """Return the steps [K] and values [K, S] of one metric in the rows of a run; a UserError says that there is none.
 
     Rows without it are left out, ``null`` is NaN, a bare number is a value of one seed.
     """
@@ -118,14 +111,14 @@ def column(rows: Sequence[Mapping[str, Any]], name: str) -> tuple[NDArray[np.int
         names = sorted({key for row in rows for key in row if key != "step"})
         near = difflib.get_close_matches(name, names, 3, 0.4) or names[:3]
         hint = f"; there is {', '.join(near)}" if near else ", and no other metric either"
-        raise NoMetricError(f"no row has the metric '{name}'{hint}")
+        raise UserError(f"no row has the metric '{name}'{hint}")
     lists = [value if isinstance(value, list) else [value] for _, value in found]
     if len({len(numbers) for numbers in lists}) > 1:
-        raise MetricsError(f"the rows of '{name}' differ in the number of seeds")
+        raise UserError(f"the rows of '{name}' differ in the number of seeds")
     try:
         values = np.array([[math.nan if v is None else float(v) for v in numbers] for numbers in lists])
     except (TypeError, ValueError, OverflowError):
-        raise MetricsError(f"the rows of '{name}' hold a value that is not a number") from None
+        raise UserError(f"the rows of '{name}' hold a value that is not a number") from None
     return np.array([step for step, _ in found], dtype=np.int64), values
 
 
@@ -149,16 +142,12 @@ class Metrics(Shown, dict[str, Floats]):
     def __init__(self, rows: Sequence[Mapping[str, Any]], seeds: Sequence[int]) -> None:
         self.seeds = tuple(seeds)
         self.steps: NDArray[np.int64] = np.array([row["step"] for row in rows], dtype=np.int64)
-        self._whole: set[str] = set()
-        for index, row in enumerate(rows):
-            for name, value in row.items():
-                if name == "step":
-                    continue
-                if name not in self:
-                    columns = len(self.seeds) if isinstance(value, list) else 1
-                    self._whole |= set() if isinstance(value, list) else {name}
-                    self[name] = np.full((len(rows), columns), math.nan)
-                self[name][index] = np.array(value, dtype=np.float64)
+        kinds = {name: type(value) for row in rows for name, value in row.items() if name != "step"}
+        self._whole = {name for name, kind in kinds.items() if kind is not list}
+        for name in kinds:
+            _, values = column(rows, name)
+            self[name] = np.full((len(rows), values.shape[1]), math.nan)
+            self[name][[name in row for row in rows]] = values
 
     def _facts(self) -> Mapping[str, object]:
         """Return what there is, and the newest mean over seeds of what was evaluated."""
@@ -200,22 +189,22 @@ def _plain(name: str, value: Value) -> float | list[float | None] | None:
     plain = value.tolist() if isinstance(value, Tensor) else value
     numbers = plain if isinstance(plain, list) else [plain]
     if not all(number is None or isinstance(number, int | float) for number in numbers):
-        raise MetricsError(f"the metric '{name}' is neither a number nor a list of one number per seed")
+        raise UserError(f"the metric '{name}' is neither a number nor a list of one number per seed")
     finite = [None if number is None or not math.isfinite(number) else number for number in numbers]
     return finite if isinstance(plain, list) else finite[0]
 
 
 def _rows(path: Path) -> Iterator[tuple[bytes, dict[str, Any]]]:
     if not path.is_file():
-        raise MetricsError(f"{path} does not exist or is not a regular file; check the path")
-    with attempting("read", path, MetricsError), open_regular(path) as file:
+        raise UserError(f"{path} does not exist or is not a regular file; check the path")
+    with attempting("read", path), open_regular(path) as file:
         for number in itertools.count(1):
-            line = file.readline(MAX_LINE_BYTES)
+            line = file.readline(_MAX_LINE_BYTES)
             row = _parse(line)
             if row is not None:
                 yield line.removesuffix(b"\n"), row
-            elif line.endswith(b"\n") or len(line) == MAX_LINE_BYTES:
-                raise MetricsError(f"{path} is damaged: line {number} is not a row of metrics; remove that line")
+            elif line.endswith(b"\n") or len(line) == _MAX_LINE_BYTES:
+                raise UserError(f"{path} is damaged: line {number} is not a row of metrics; remove that line")
             else:  # the end, or a line that a killed process had not finished
                 return
 

@@ -11,7 +11,7 @@ Layout::
 
 Every file but the metrics is replaced as a whole, so that a process may be killed at any moment: the next one goes on
 from the newest checkpoint that is good. A checkpoint carries the identity of its run and a digest of its configuration;
-that of another run is neither resumed nor removed. What the user can correct is a RunFolderError.
+that of another run is neither resumed nor removed. What the user can correct is a UserError.
 """
 
 from __future__ import annotations
@@ -30,11 +30,10 @@ from torch import Tensor
 from esp_cli.files.documents import DocumentFormat
 from esp_cli.files.formatting import attempting
 from esp_cli.files.opening import holding, open_own
-from esp_cli.files.writing import TEMPORARY_PREFIX, sync_file
+from esp_cli.files.writing import TEMPORARY_PREFIX
 from esp_cli.training.checkpoint import (
     CHECKPOINT_FORMAT,
     POLICY_FORMAT,
-    CheckpointError,
     digest,
     load_checkpoint,
     read_description,
@@ -48,11 +47,7 @@ RUN_ID, CONFIG_SHA256 = "run_id", "config_sha256"  # keys of `config.json` and o
 _CHECKPOINT_NAME = re.compile(r"step-(\d{12})(-final)?\.safetensors")
 
 
-class RunFolderError(UserError):
-    """A run folder cannot be made, opened or locked; the text is one sentence for the user."""
-
-
-RUN_FORMAT = DocumentFormat("esp-run", 1, "the configuration of a run", RunFolderError)
+RUN_FORMAT = DocumentFormat("esp-run", 1, "the configuration of a run")
 
 
 def read_run_config(path: Path) -> tuple[dict[str, Any], str | None]:
@@ -60,7 +55,7 @@ def read_run_config(path: Path) -> tuple[dict[str, Any], str | None]:
     config = RUN_FORMAT.read(path)
     identity = config.pop(RUN_ID, None)
     if not isinstance(identity, str | None):
-        raise RunFolderError(f"{path} is damaged: its {RUN_ID} is not a text")
+        raise UserError(f"{path} is damaged: its {RUN_ID} is not a text")
     return config, identity
 
 
@@ -83,9 +78,9 @@ class RunFolder:
     ) -> RunFolder:
         """Make a run folder; its configuration is written last, so that a folder with one is complete."""
         path = Path(path)
-        with attempting("make the run folder", path, RunFolderError):
+        with attempting("make the run folder", path):
             if path.exists() and not path.is_dir():
-                raise RunFolderError(f"{path} is a file; choose another --out")
+                raise UserError(f"{path} is a file; choose another --out")
             path.mkdir(parents=True, exist_ok=True)
             _refuse_taken(path)
             folder = cls(path, config, secrets.token_hex(16))
@@ -108,16 +103,16 @@ class RunFolder:
             return cls(path, *read_run_config(path / CONFIG))
         what = "is a file, not a run folder" if path.exists() else "does not exist"
         what = f"is no run folder: it has no {CONFIG}" if path.is_dir() else what
-        raise RunFolderError(f"{path} {what}; give the folder that esp train --out made")
+        raise UserError(f"{path} {what}; give the folder that esp train --out made")
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
         """Hold the folder, so that no second process writes to it; what a killed one left half-written is removed."""
         checkpoints = self.path / CHECKPOINTS
         if checkpoints.is_symlink():
-            raise RunFolderError(f"{checkpoints} is a link, which is not followed; put the folder itself there")
-        with holding(self.lock_path, RunFolderError):
-            with attempting("tidy up", self.path, RunFolderError):
+            raise UserError(f"{checkpoints} is a link, which is not followed; put the folder itself there")
+        with holding(self.lock_path):
+            with attempting("tidy up", self.path):
                 for folder in (self.path, checkpoints):
                     for file in folder.glob(f"{TEMPORARY_PREFIX}*"):
                         file.unlink(missing_ok=True)
@@ -141,9 +136,11 @@ class RunFolder:
         the run has gone back from there; those of another run stay.
         """
         path = self.checkpoint_path(step, final)
-        with attempting("write", path, RunFolderError):
+        with attempting("write", path):
             path.parent.mkdir(exist_ok=True)
-            sync_file(self.metrics_path)
+            if self.metrics_path.exists():
+                with self.metrics_path.open("rb+") as metrics:
+                    os.fsync(metrics.fileno())
         stamp = {RUN_ID: self.identity, CONFIG_SHA256: self._config_sha256}
         save_checkpoint(path, tensors, {**meta, **stamp, "step": step})
         regular, finals, past = list[Path](), list[Path](), list[Path]()
@@ -168,8 +165,8 @@ class RunFolder:
             try:
                 tensors, meta = load_checkpoint(file)
                 if meta.get("step") != step_of(file):
-                    raise CheckpointError(f"{file} does not hold the step that its name says")
-            except CheckpointError as error:
+                    raise UserError(f"{file} does not hold the step that its name says")
+            except UserError as error:
                 if file.exists():  # another process may have ended the run, and removed it, since it was listed
                     problem = problem or str(error)
                 continue
@@ -178,7 +175,7 @@ class RunFolder:
                 note(f"{problem}; going back to step {step_of(file)}")
             return tensors, {key: value for key, value in meta.items() if key not in (RUN_ID, CONFIG_SHA256)}
         if problem and not self.policy_path.is_file():
-            raise RunFolderError(f"{self.path} has no good checkpoint ({problem}); train anew under another --out")
+            raise UserError(f"{self.path} has no good checkpoint ({problem}); train anew under another --out")
         if problem:
             note(f"{problem}; taking {self.policy_path}")
         return None
@@ -186,7 +183,7 @@ class RunFolder:
     def task_version(self) -> int | None:
         """Return the version of the task that the run was trained on; None where no good file states it."""
         for file in (self.policy_path, *reversed(self.checkpoints())):
-            with contextlib.suppress(CheckpointError):
+            with contextlib.suppress(UserError):
                 about = read_description(file, POLICY_FORMAT if file == self.policy_path else CHECKPOINT_FORMAT)
                 if type(version := about.get("task_version")) is int:
                     return version
@@ -195,9 +192,9 @@ class RunFolder:
     def _require_own(self, file: Path, meta: Mapping[str, Any]) -> None:
         """Refuse a checkpoint of another run, or one that was written under another configuration."""
         if meta.get(RUN_ID) != self.identity:
-            raise CheckpointError(f"{file} is a checkpoint of another run; move it out of this folder")
+            raise UserError(f"{file} is a checkpoint of another run; move it out of this folder")
         if meta.get(CONFIG_SHA256, self._config_sha256) != self._config_sha256:
-            raise CheckpointError(
+            raise UserError(
                 f"{file} was written under another configuration than that in {self.path / CONFIG}; restore that "
                 "file, or train anew under another --out"
             )
@@ -210,10 +207,10 @@ class RunFolder:
     def _remove(self, checkpoints: Iterable[Path]) -> None:
         for file in checkpoints:
             own = True
-            with contextlib.suppress(CheckpointError):
+            with contextlib.suppress(UserError):
                 own = read_description(file).get(RUN_ID) == self.identity
             if own:
-                with attempting("remove", file, RunFolderError):
+                with attempting("remove", file):
                     file.unlink(missing_ok=True)
 
 
@@ -236,12 +233,10 @@ def _is_final(checkpoint: Path) -> bool:
 def _refuse_taken(path: Path) -> None:
     """Refuse a folder that holds a run or files that no run has."""
     if (path / CONFIG).exists():
-        raise RunFolderError(
-            f"{path} exists: resume with esp train --resume {quote(str(path))} or choose another --out"
-        )
+        raise UserError(f"{path} exists: resume with esp train --resume {quote(str(path))} or choose another --out")
     foreign = sorted(entry.name for entry in path.iterdir() if not _is_leftover(entry))
     if foreign:
-        raise RunFolderError(f"{path} is not empty and no run folder (it has {foreign[0]!r}); choose another --out")
+        raise UserError(f"{path} is not empty and no run folder (it has {foreign[0]!r}); choose another --out")
 
 
 def _is_leftover(entry: Path) -> bool:

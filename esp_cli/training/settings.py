@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
 from esp_cli.algorithms.presets import ALGORITHMS, FAST, PAPER, PRESETS, SETS, TUNED, Sections
 from esp_cli.defaults import __version__
-from esp_cli.files.documents import flat, one_sentence, read_table, validate
+from esp_cli.files.documents import flat, read_table, validate
 from esp_cli.files.formatting import did_you_mean, shortened
 from esp_cli.networks.build import NETWORKS
 from esp_cli.prior import PriorConfig
@@ -102,9 +102,9 @@ def _settings(section: str, model: type[BaseModel]) -> tuple[Setting, ...]:
     return tuple(
         Setting(
             name=f"{section}.{name}",
-            type=_type(schema[name]),
+            type=kind,
             default=schema[name].get("default"),
-            bounds=_bounds(schema[name]),
+            bounds=bounds,
             unit=str(schema[name].get("unit", "")) or next((_UNITS[e] for e in _UNITS if f"_{name}".endswith(e)), ""),
             description=field.description or "",
             presets=_changes(section, name, PRESETS)
@@ -113,6 +113,7 @@ def _settings(section: str, model: type[BaseModel]) -> tuple[Setting, ...]:
             tasks=_changes(section, name, TUNED) | _changes(section, name, SETS, "sets on "),
         )
         for name, field in model.model_fields.items()
+        for kind, bounds in [_values(schema[name])]
         if (section, name) != ("network", "name")
     )
 
@@ -126,31 +127,23 @@ def _changes(section: str, name: str, layers: Mapping[str, Mapping[str, Sections
     }
 
 
-def _shapes(schema: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Return the alternatives of a setting without null, which stands for its default."""
-    return [shape for shape in schema.get("anyOf", [schema]) if shape.get("type") != "null"]
-
-
-def _type(schema: Mapping[str, Any]) -> str:
-    words = {"boolean": "flag", "string": "text", "array": "list"}
-    kinds = [(str(shape.get("type", "text")), shape.get("items")) for shape in _shapes(schema)]
-    found = [words.get(word, word) + (f" of {_type(items)}s" if items else "") for word, items in kinds]
-    return " or ".join(dict.fromkeys(found))
-
-
-def _bounds(schema: Mapping[str, Any]) -> str:
-    """Say which values a setting may have: "from 1", "above 0 to 1", "relu, tanh"."""
-    found = []
-    for shape in _shapes(schema):
+def _values(schema: Mapping[str, Any]) -> tuple[str, str]:
+    """Return the type of a setting and which values it may have: "integer" and "from 1", "text" and "relu, tanh"."""
+    types = {"boolean": "flag", "string": "text", "array": "list"}
+    limits = {"minimum": "from", "exclusiveMinimum": "above", "maximum": "to", "exclusiveMaximum": "below"}
+    kinds, all_bounds = list[str](), list[str]()
+    for shape in schema.get("anyOf", [schema]):
+        kind = str(shape.get("type", "text"))
+        bounds = " ".join(f"{word} {shape[key]:g}" for key, word in limits.items() if key in shape)
         if "enum" in shape:
-            found.append(", ".join(map(str, shape["enum"])))
+            bounds = ", ".join(map(str, shape["enum"]))
         elif "items" in shape:
-            inner = _bounds(shape["items"])
-            found.append(f"each {inner}" if inner else "")
-        else:
-            words = {"minimum": "from", "exclusiveMinimum": "above", "maximum": "to", "exclusiveMaximum": "below"}
-            found.append(" ".join(f"{word} {shape[key]:g}" for key, word in words.items() if key in shape))
-    return ", ".join(filter(None, found))
+            item, inner = _values(shape["items"])
+            kind, bounds = f"list of {item}s", f"each {inner}" if inner else ""
+        if kind != "null":  # which stands for the default
+            kinds.append(types.get(kind, kind))
+            all_bounds.append(bounds)
+    return " or ".join(dict.fromkeys(kinds)), ", ".join(filter(None, all_bounds))
 
 
 CHOICES = ("task", "algorithm", "preset", "steps", "seeds", "device", "init_from")  # of a file, beside settings
@@ -206,11 +199,11 @@ def _of_run(path: Path, config: RunConfig) -> ConfigFile:
 def parse_config(data: object, source: Path, writer: object = __version__) -> RunConfig:
     """Validate a configuration that a run folder or file holds, as JSON gave it and a version of esp wrote it."""
     try:
-        config = validate(RunConfig, data)
-    except ValidationError as error:
+        config = validate(RunConfig, data, "config")
+    except UserError as error:
         # Another version may have had another name for a setting; of one version that is damage.
         other = "" if writer == __version__ else f" (written by esp {str(writer)[:20]}, this is {__version__})"
-        raise UserError(f"{source}: {one_sentence(error, RunConfig, 'config')}{other}") from None
+        raise UserError(f"{source}: {error}{other}") from None
     try:
         return completed(config)
     except UserError as error:

@@ -205,7 +205,6 @@ def require(names: Sequence[str]) -> None:
 
 def open_trackers(names: Sequence[str], run: TrackedRun, tell: Callable[[str], None]) -> list[Guarded]:
     """Open trackers for a run; one that cannot be opened is told and left out."""
-    require(names)
     return [Guarded(name, partial(TRACKERS[name], run), tell) for name in dict.fromkeys(names)]
 
 

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from esp_cli.files.opening import LockError, holding, is_held, open_own, read_regular
+from esp_cli.files.opening import holding, is_held, open_own, read_regular
+from esp_envs.errors import UserError
 
 FLAGS = pytest.mark.parametrize("flags", [os.O_RDWR, os.O_WRONLY | os.O_APPEND])
 
@@ -71,7 +72,7 @@ def test_a_lock_is_let_go_of_though_a_forked_process_lives_on(tmp_path: Path) ->
             if not child:
                 signal.pause()
             assert is_held(file)
-            with pytest.raises(LockError, match=f"in use by process {os.getpid()}"), holding(file):
+            with pytest.raises(UserError, match=f"in use by process {os.getpid()}"), holding(file):
                 pytest.fail("held twice")
         assert not is_held(file)
         with holding(file):

@@ -7,10 +7,7 @@ import pytest
 
 from esp_cli.files import formatting
 from esp_cli.files.formatting import did_you_mean, nearest
-
-
-class ToyError(ValueError):
-    pass
+from esp_envs.errors import UserError
 
 
 def failed(number):
@@ -19,13 +16,13 @@ def failed(number):
 
 @pytest.mark.parametrize("number", [errno.ENOENT, errno.EACCES, errno.ELOOP, errno.ENAMETOOLONG, errno.EISDIR])
 def test_what_the_user_can_correct_becomes_one_sentence(number):
-    with pytest.raises(ToyError, match="cannot write a/b: "), formatting.attempting("write", "a/b", ToyError):
+    with pytest.raises(UserError, match="cannot write a/b: "), formatting.attempting("write", "a/b"):
         raise failed(number)
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO])
 def test_a_failure_of_the_machine_passes_and_names_the_path(number):
-    with pytest.raises(OSError, match="a/b") as caught, formatting.attempting("write", "a/b", ToyError):
+    with pytest.raises(OSError, match="a/b") as caught, formatting.attempting("write", "a/b"):
         raise failed(number)
     assert caught.value.errno == number
     assert not formatting.is_correctable(caught.value)

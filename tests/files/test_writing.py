@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from esp_cli.files.writing import TEMPORARY_PREFIX, mend_last_line, replace_file, write_file
-from esp_envs.errors import UserError
+from esp_cli.files.writing import TEMPORARY_PREFIX, replace_file, write_file
 from tests.faults import Fault
 
 WRITERS = pytest.mark.parametrize("write", [write_file, replace_file])
@@ -184,22 +183,3 @@ def test_a_signal_that_is_only_noted_in_the_middle_of_a_write_leaves_every_byte_
         signal.signal(signal.SIGTERM, before)
     assert noted == [signal.SIGTERM]
     assert (tmp_path / "a").read_bytes() == b"whole\n"
-
-
-@pytest.mark.parametrize(
-    ("content", "mended"),
-    [(b"", b""), (b"a\nb\n", b"a\nb\n"), (b"a\nb", b"a\n"), (b"b", b""), (b"a\n" + b"x" * 700_000, b"a\n")],
-)
-def test_a_torn_last_line_goes(tmp_path, content, mended):
-    (tmp_path / "a").write_bytes(content)
-    mend_last_line(tmp_path / "a")
-    assert (tmp_path / "a").read_bytes() == mended
-    mend_last_line(tmp_path / "missing")
-    assert not (tmp_path / "missing").exists()
-
-
-def test_a_last_line_of_gigabytes_is_refused_before_it_is_read(tmp_path):
-    with (tmp_path / "a").open("wb") as file:
-        file.truncate(40 * 2**30)  # a hole, which takes no space
-    with pytest.raises(UserError, match="its last line has more than"):
-        mend_last_line(tmp_path / "a")

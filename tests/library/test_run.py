@@ -12,7 +12,8 @@ from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.run import begin
 from esp_cli.training.config import resolve_config
 from esp_cli.training.metrics import Metrics, column, read_metrics
-from esp_cli.training.run_folder import RunFolder, RunFolderError
+from esp_cli.training.run_folder import RunFolder
+from esp_envs.errors import UserError
 from tests.cli.running import esp
 
 SMALL = {"mappo.num_envs": 4, "mappo.num_steps": 25, "evaluation.every_steps": 200, "evaluation.episodes": 2}
@@ -173,7 +174,7 @@ def test_a_name_that_another_program_takes_meanwhile_is_left_to_it(tmp_path, mon
         asked.append(path.name)
         if len(asked) == 1:
             path.mkdir(parents=True)
-            raise RunFolderError(f"{path} is in use")
+            raise UserError(f"{path} is in use")
         return create(path, *given, **named)
 
     monkeypatch.setattr(RunFolder, "create", late)

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from esp_cli.files.opening import LockError, is_held
+from esp_cli.files.opening import is_held
 from esp_cli.files.writing import TEMPORARY_PREFIX
 from esp_cli.studies.engine import LocalEngine
 from esp_cli.studies.study import StudyFolder, read_evaluation
@@ -109,7 +109,7 @@ def test_one_process_holds_a_study(tmp_path):
     path = tmp_path / "s"
     with StudyFolder.held(path):
         StudyFolder.create(path, small_study())
-        with pytest.raises(LockError, match="is in use by process"), StudyFolder.held(path):
+        with pytest.raises(UserError, match="is in use by process"), StudyFolder.held(path):
             pass
         assert is_held(path / "study.lock")
     assert not is_held(path / "study.lock")
@@ -245,7 +245,7 @@ def test_planted_links_at_the_lock_and_the_log_are_not_written_to(tmp_path):
     mine = tmp_path / "mine.txt"
     mine.write_text("mine")
     (folder.path / "study.lock").symlink_to(mine)
-    with pytest.raises(LockError, match="no regular file is there; remove it"), StudyFolder.held(folder.path):
+    with pytest.raises(UserError, match="no regular file is there; remove it"), StudyFolder.held(folder.path):
         pass
     log = tmp_path / "log.txt"
     log.symlink_to(mine)

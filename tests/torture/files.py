@@ -30,10 +30,11 @@ from esp_cli.studies.study import StudyFolder, read_evaluation
 from esp_cli.symmetry.admission import admitted_elements
 from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
 from esp_cli.training.config import resolve_config
-from esp_cli.training.metrics import MetricsError, column, read_last_row, read_metrics
+from esp_cli.training.metrics import column, read_last_row, read_metrics
 from esp_cli.training.run_folder import RUN_FORMAT, RunFolder
 from esp_cli.training.settings import parse_config, read_config_file
 from esp_cli.training.trainer import Trainer
+from esp_envs.errors import UserError
 from esp_envs.registry import make
 from esp_envs.spec import TaskSpec
 from tests.studies.small_studies import request
@@ -245,7 +246,7 @@ def _config(path: Path) -> str | None:
 
 def _metrics(path: Path) -> None:
     read_last_row(path)
-    with contextlib.suppress(MetricsError):
+    with contextlib.suppress(UserError):
         column(read_metrics(path), "eval/return_greedy")
 
 

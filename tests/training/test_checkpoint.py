@@ -1,4 +1,4 @@
-"""Checkpoint files: what goes in comes out, and whatever else is in a file ends in one CheckpointError."""
+"""Checkpoint files: what goes in comes out, and whatever else is in a file ends in one UserError."""
 
 import hashlib
 import json
@@ -10,7 +10,8 @@ import pytest
 import safetensors.torch
 import torch
 
-from esp_cli.training.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
+from esp_envs.errors import UserError
 
 META = {"step": 500_000, "task": "navigation", "nested": {"list": [1, 2.5, None, True], "text": "é"}}
 
@@ -87,7 +88,7 @@ def test_policy_files_have_their_description_at_the_top_level(tmp_path):
     assert description.pop("sha256")
     assert description == {"format": "esp-policy", "version": 1, **meta}
     assert load_checkpoint(path, format_name="esp-policy")[1] == meta
-    with pytest.raises(CheckpointError, match="format 'esp-policy', where 'esp-checkpoint' is needed"):
+    with pytest.raises(UserError, match="format 'esp-policy', where 'esp-checkpoint' is needed"):
         load_checkpoint(path)
 
 
@@ -102,13 +103,13 @@ def test_policy_files_have_their_description_at_the_top_level(tmp_path):
     ],
 )
 def test_what_cannot_be_stored_is_refused_and_nothing_is_written(tmp_path, content, meta, text):
-    with pytest.raises(CheckpointError, match=text):
+    with pytest.raises(UserError, match=text):
         save_checkpoint(tmp_path / "a", content, meta)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_missing_folder_is_one_sentence(tmp_path):
-    with pytest.raises(CheckpointError, match=r"cannot write .*no/a: No such file or directory"):
+    with pytest.raises(UserError, match=r"cannot write .*no/a: No such file or directory"):
         save_checkpoint(tmp_path / "no" / "a", {}, {})
 
 
@@ -180,7 +181,7 @@ HOSTILE = {
 def test_hostile_files_end_in_one_sentence(tmp_path, name):
     path = tmp_path / "bad.safetensors"
     path.write_bytes(HOSTILE[name])
-    with pytest.raises(CheckpointError) as caught:
+    with pytest.raises(UserError) as caught:
         load_checkpoint(path)
     text = str(caught.value)
     assert text.startswith(f"{path} ")
@@ -194,7 +195,7 @@ def test_truth_values_are_zero_or_one(tmp_path):
     digest.update(b'["a","torch.bool",[1]]' + b"\x02")
     bad = build({"a": entry("BOOL", (1,), (0, 1))}, b"\x02", {**description, "sha256": digest.hexdigest()})
     (tmp_path / "a").write_bytes(bad)
-    with pytest.raises(CheckpointError, match="truth values other than 0 and 1"):
+    with pytest.raises(UserError, match="truth values other than 0 and 1"):
         load_checkpoint(tmp_path / "a")
 
 
@@ -203,7 +204,7 @@ def test_what_is_no_plain_file_is_refused_without_waiting(tmp_path, kind):
     path = {"device": Path("/dev/zero"), "folder": tmp_path}.get(kind, tmp_path / "x")
     if kind == "pipe":
         os.mkfifo(path)
-    with pytest.raises(CheckpointError, match="is a folder" if kind == "folder" else "no plain file"):
+    with pytest.raises(UserError, match="is a folder" if kind == "folder" else "no plain file"):
         load_checkpoint(path)
 
 
@@ -213,13 +214,13 @@ def test_every_flipped_bit_and_every_cut_is_noticed(tmp_path):
     good = path.read_bytes()
     for position in range(len(good)):
         path.write_bytes(good[:position])
-        with pytest.raises(CheckpointError):
+        with pytest.raises(UserError):
             load_checkpoint(path)
         for bit in range(8):
             flipped = bytearray(good)
             flipped[position] ^= 1 << bit
             path.write_bytes(flipped)
-            with pytest.raises(CheckpointError):
+            with pytest.raises(UserError):
                 load_checkpoint(path)
 
 
@@ -228,5 +229,5 @@ def test_a_file_larger_than_its_header_declares_is_refused_before_it_is_read(tmp
     save_checkpoint(path, small_tensors(), META)
     with path.open("rb+") as file:
         file.truncate(40 * 2**30)  # a hole, which takes no space
-    with pytest.raises(CheckpointError, match="its size, 42949672960 bytes, is not what its header declares"):
+    with pytest.raises(UserError, match="its size, 42949672960 bytes, is not what its header declares"):
         load_checkpoint(path)

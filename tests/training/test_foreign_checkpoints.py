@@ -6,9 +6,10 @@ from pathlib import Path
 import pytest
 
 from esp_cli.training import trainer
-from esp_cli.training.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
+from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.settings import parse_config
+from esp_envs.errors import UserError
 from tests.training.runs import tiny_folder
 
 
@@ -23,7 +24,7 @@ def test_a_checkpoint_of_another_run_is_neither_resumed_nor_removed(tmp_path: Pa
     folder = tiny_folder(tmp_path / "x", seeds=(7, 8), prior__kind="none")  # even of the same configuration
     copied = folder.path / "checkpoints" / other.checkpoints()[-1].name
     shutil.copy(other.checkpoints()[-1], copied)
-    with pytest.raises(CheckpointError, match=r"-final\.safetensors is a checkpoint of another run; move it out"):
+    with pytest.raises(UserError, match=r"-final\.safetensors is a checkpoint of another run; move it out"):
         folder.latest_checkpoint(pytest.fail)
     tensors, _ = other.latest_checkpoint(pytest.fail)
     for step in (50, 100, 150, 200, 250):
@@ -36,7 +37,7 @@ def test_a_checkpoint_of_another_run_is_neither_resumed_nor_removed(tmp_path: Pa
 def test_a_checkpoint_of_another_configuration_is_not_resumed(tmp_path: Path) -> None:
     folder = RunFolder.open(finished_folder(tmp_path / "x"))
     changed = RunFolder(folder.path, {**folder.config, "steps": 600}, folder.identity)
-    with pytest.raises(CheckpointError, match=r"was written under another configuration than that in .*config\.json"):
+    with pytest.raises(UserError, match=r"was written under another configuration than that in .*config\.json"):
         changed.latest_checkpoint(pytest.fail)
 
 

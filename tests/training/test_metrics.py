@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from esp_cli.training import metrics
-from esp_cli.training.metrics import MetricsError, MetricsWriter, column, read_last_row, read_metrics, truncate_metrics
+from esp_cli.training.metrics import MetricsWriter, column, read_last_row, read_metrics, truncate_metrics
+from esp_envs.errors import UserError
 
 ROWS = [
     {"step": 100, "train/loss": [1.0, 2.0], "time/seconds": 0.5},
@@ -54,13 +55,13 @@ def test_each_row_is_in_the_file_when_write_returns(tmp_path):
 @pytest.mark.parametrize("value", ["text", [[1.0]], {"a": 1}, torch.zeros(2, 2)])
 def test_what_is_no_number_is_refused(tmp_path, value):
     path = tmp_path / "m.jsonl"
-    with MetricsWriter(path) as writer, pytest.raises(MetricsError, match="'train/loss' is neither a number"):
+    with MetricsWriter(path) as writer, pytest.raises(UserError, match="'train/loss' is neither a number"):
         writer.write(1, {"train/loss": value})
     assert path.read_text() == ""
 
 
 def test_step_is_no_metric(tmp_path):
-    with MetricsWriter(tmp_path / "m.jsonl") as writer, pytest.raises(MetricsError, match="'step' is the row's own"):
+    with MetricsWriter(tmp_path / "m.jsonl") as writer, pytest.raises(UserError, match="'step' is the row's own"):
         writer.write(1, {"step": 2.0})
 
 
@@ -94,7 +95,7 @@ def test_column_is_steps_and_values_per_seed(path):
     ],
 )
 def test_columns_that_are_not_there_are_one_sentence(rows, text):
-    with pytest.raises(MetricsError, match=text):
+    with pytest.raises(UserError, match=text):
         column(rows, "train/loss")
 
 
@@ -112,12 +113,12 @@ def test_the_last_line_may_be_torn_at_any_byte(path):
 def test_damage_inside_is_told_with_its_line(path, line):
     lines = path.read_bytes().split(b"\n")
     path.write_bytes(b"\n".join([lines[0], line, *lines[1:]]))
-    with pytest.raises(MetricsError, match=r"metrics\.jsonl is damaged: line 2 is not a row"):
+    with pytest.raises(UserError, match=r"metrics\.jsonl is damaged: line 2 is not a row"):
         read_metrics(path)
 
 
 def test_a_missing_file_is_one_sentence(tmp_path):
-    with pytest.raises(MetricsError, match="does not exist"):
+    with pytest.raises(UserError, match="does not exist"):
         read_metrics(tmp_path / "m.jsonl")
 
 
@@ -142,7 +143,7 @@ def test_a_torn_line_does_not_swallow_the_next_row(path):
 
 
 def test_the_last_row_is_found_however_long_it_is(path, monkeypatch):
-    monkeypatch.setattr(metrics, "TAIL_BYTES", 8)
+    monkeypatch.setattr(metrics, "_TAIL_BYTES", 8)
     with path.open("a") as file:
         file.write('{"step": 400, "train/l')
     assert read_last_row(path) == ROWS[-1]
@@ -154,9 +155,9 @@ def test_a_file_of_forty_gigabytes_that_holds_nothing_is_one_sentence(tmp_path):
     path = tmp_path / "metrics.jsonl"
     with path.open("wb") as file:
         file.truncate(40 * 2**30)  # a hole, which takes no space
-    with pytest.raises(MetricsError, match="line 1 is not a row of metrics"):
+    with pytest.raises(UserError, match="line 1 is not a row of metrics"):
         read_metrics(path)
-    with pytest.raises(MetricsError, match="line 1 is not a row of metrics"):
+    with pytest.raises(UserError, match="line 1 is not a row of metrics"):
         truncate_metrics(path, 100)
     assert read_last_row(path) == {}
     assert [entry.name for entry in tmp_path.iterdir()] == ["metrics.jsonl"]

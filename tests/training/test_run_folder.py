@@ -9,7 +9,8 @@ import torch
 
 from esp_cli.files.writing import TEMPORARY_PREFIX
 from esp_cli.training.metrics import read_metrics
-from esp_cli.training.run_folder import RunFolder, RunFolderError
+from esp_cli.training.run_folder import RunFolder
+from esp_envs.errors import UserError
 from tests.faults import Fault
 
 CONFIG = {"task": "navigation", "seeds": [0, 1], "algorithm": {"learning_rate": 7e-4, "clip": None}}
@@ -57,7 +58,7 @@ def test_create_then_open_gives_the_configuration_back(folder):
 
 def test_create_refuses_an_existing_run_and_leaves_it_alone(folder):
     write_checkpoints(folder, 100)
-    with pytest.raises(RunFolderError) as caught:
+    with pytest.raises(UserError) as caught:
         RunFolder.create(folder.path, {"task": "other"})
     assert str(caught.value) == (
         f"{folder.path} exists: resume with esp train --resume {folder.path} or choose another --out"
@@ -73,7 +74,7 @@ def test_create_never_touches_a_foreign_folder(tmp_path, name):
     file = tmp_path / name
     file.parent.mkdir(exist_ok=True)
     file.write_text('{"model_type": "llama"}')
-    with pytest.raises(RunFolderError, match=r"not empty and no run folder|exists: resume|is foreign"):
+    with pytest.raises(UserError, match=r"not empty and no run folder|exists: resume|is foreign"):
         RunFolder.create(tmp_path, CONFIG)
     assert [entry for entry in tmp_path.rglob("*") if entry.is_file()] == [file]
     assert file.read_text() == '{"model_type": "llama"}'
@@ -90,15 +91,15 @@ def test_create_takes_an_empty_or_half_made_folder(tmp_path):
 
 def test_create_on_a_file_or_without_permission_is_one_sentence(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(RunFolderError, match="is a file; choose another --out"):
+    with pytest.raises(UserError, match="is a file; choose another --out"):
         RunFolder.create(tmp_path / "file", CONFIG)
-    with pytest.raises(RunFolderError, match=r"cannot make the run folder .*: Not a directory"):
+    with pytest.raises(UserError, match=r"cannot make the run folder .*: Not a directory"):
         RunFolder.create(tmp_path / "file" / "run", CONFIG)
 
 
 def test_a_run_whose_identity_is_no_text_is_one_sentence(tmp_path):
     (tmp_path / "config.json").write_text('{"format": "esp-run", "version": 1, "run_id": 3}')
-    with pytest.raises(RunFolderError, match=f"^{re.escape(str(tmp_path))}.* is damaged: its run_id is not a text"):
+    with pytest.raises(UserError, match=f"^{re.escape(str(tmp_path))}.* is damaged: its run_id is not a text"):
         RunFolder.open(tmp_path)
 
 
@@ -182,12 +183,12 @@ def test_a_damaged_future_does_not_push_out_good_checkpoints(folder):
 def test_one_process_cannot_hold_a_folder_twice_but_again(folder):
     with folder.lock():
         with (
-            pytest.raises(RunFolderError, match=f"is in use by process {os.getpid()} on '.+'; wait for it"),
+            pytest.raises(UserError, match=f"is in use by process {os.getpid()} on '.+'; wait for it"),
             folder.lock(),
         ):
             pytest.fail("held twice")
         (folder.path / "config.json").unlink()  # as if another process were still making the folder
-        with pytest.raises(RunFolderError, match="is in use by"):
+        with pytest.raises(UserError, match="is in use by"):
             RunFolder.create(folder.path, CONFIG)
     with folder.lock():
         pass
@@ -197,7 +198,7 @@ def test_one_process_cannot_hold_a_folder_twice_but_again(folder):
 def test_a_damaged_lock_file_still_locks(folder, content):
     with folder.lock():
         (folder.path / "run.lock").write_bytes(content)
-        with pytest.raises(RunFolderError, match="is in use by another process"), folder.lock():
+        with pytest.raises(UserError, match="is in use by another process"), folder.lock():
             pytest.fail("held twice")
 
 
@@ -217,7 +218,7 @@ def test_planted_links_in_a_run_folder_lead_nowhere(folder, tmp_path):
     folder.write_policy(weights(1), {"task": "navigation"})
     folder.lock_path.unlink()
     folder.lock_path.symlink_to(mine)
-    with pytest.raises(RunFolderError, match="no regular file is there; remove it"), folder.lock():
+    with pytest.raises(UserError, match="no regular file is there; remove it"), folder.lock():
         pass
     assert mine.read_text() == "mine\n"
 
@@ -236,6 +237,6 @@ def test_a_link_at_the_checkpoints_is_refused_before_anything_is_removed(folder,
     (tmp_path / "outside" / f"{TEMPORARY_PREFIX}mine").touch()
     (folder.path / "checkpoints").rmdir()
     (folder.path / "checkpoints").symlink_to(tmp_path / "outside")
-    with pytest.raises(RunFolderError, match="checkpoints is a link, which is not followed"), folder.lock():
+    with pytest.raises(UserError, match="checkpoints is a link, which is not followed"), folder.lock():
         pass
     assert len(list((tmp_path / "outside").iterdir())) == 1
