@@ -191,7 +191,7 @@ def _checked(name: str, files: Files, job: Job) -> Export:
 
 
 def _readme(job: Job, results: Sequence[Export]) -> bytes:
-    settings, example = job.trained.spec.settings, job.description["example"]
+    example = job.description["example"]
     readme = filled(
         "README.md",
         **job.words,
@@ -199,6 +199,5 @@ def _readme(job: Job, results: Sequence[Export]) -> bytes:
         results=results,
         states=epuck.STATES,
         robot=None if job.scenes is None else job.description["robot"],
-        seen_robots=0 if job.scenes is None else epuck.seen_robots(settings),
     )
     return c_file.of_role(readme, job.trained.role)
