@@ -127,7 +127,7 @@ def export_all(
 def _made(trained: TrainedPolicy, formats: Sequence[str]) -> tuple[Exported, Files]:
     """Make the files of an export and check each format; nothing is written yet."""
     formats = tuple(dict.fromkeys(formats))
-    program = program_of(trained.policy, trained.spec.masks)
+    program = program_of(trained.policy)
     sample = take_sample(trained, program)
     description = describe(trained, program, sample)
     drives = "robot" in description and "numpy" in formats and not program.memory_width
