@@ -81,11 +81,9 @@ class PartsKind(Kind):
 
     def matrix(self, planar: Floats) -> Floats:
         """Return how the numbers of one item transform under a matrix of the plane that is a symmetry of the body."""
-        for element, rows in self.moves:
+        for element, rows in (*self.moves, (PlaneElement(), np.eye(self.width))):
             if np.allclose(element.matrix, planar, atol=1e-9):
                 return np.array(rows)
-        if np.allclose(planar, np.eye(2), atol=1e-9):
-            return np.eye(self.width)
         known = ", ".join(element.name for element, _ in self.moves)
         if not known:
             raise UserError(f"the body has no symmetry for its {self.name}")
