@@ -86,22 +86,13 @@ class Quadruped(BatchedTask):
 
     def _start(self, generator: torch.Generator) -> World:
         drawn = self.draw(19, generator=generator)
-        phase = math.pi * drawn[:, 18:]
-        zeros = torch.zeros(self.num_envs, 12, device=self.device)
+        phase, still = math.pi * drawn[:, 18:], torch.zeros(self.num_envs, 27, device=self.device)
         most = torch.tensor([self.settings.speed, self.settings.speed / 2, self.settings.turning], device=self.device)
         upright = torch.tensor([0, 0, HEIGHT_M, 1, 0, 0, 0], device=self.device).expand(self.num_envs, 7)
-        parts = {
-            "place": upright[:, :3],
-            "attitude": upright[:, 3:],
-            "positions": 0.1 * drawn[:, :12],
-            "velocity": 0.2 * drawn[:, 12:15],
-            "spin": zeros[:, :3],
-            "velocities": zeros,
-            "before": zeros,
-            "command": most * drawn[:, 15:18],
-        }
-        clock = torch.stack([phase.cos(), phase.sin()], -2)
-        return {name: value.unsqueeze(-2).contiguous() for name, value in parts.items()} | {"clock": clock}
+        # as the state has them: place and attitude, positions, velocity, all that is still, command and clock
+        angles, velocity = 0.1 * drawn[:, :12], 0.2 * drawn[:, 12:15]
+        parts = [upright, angles, velocity, still, most * drawn[:, 15:18], phase.cos(), phase.sin()]
+        return self._split(torch.cat(parts, -1))
 
     def _advance(self, world: World, action: Tensor) -> Outcome:
         action = action.flatten(2)
