@@ -97,10 +97,13 @@ class Quadruped(BatchedTask):
     def _advance(self, world: World, action: Tensor) -> Outcome:
         action = action.flatten(2)
         change = action - world["before"].flatten(2)
-        self._write(world)
-        self._rows["ctrl"][:] = (SWING_RAD * action).flatten(0, 1).cpu().numpy()
+        qpos, qvel, rest = self._parts(self._state())
+        sent = {"qpos": qpos, "qvel": qvel, "ctrl": SWING_RAD * action}
+        for name, rows in sent.items():
+            self._rows[name][:] = rows.flatten(0, 1).cpu().numpy()
+        self._rows["qacc_warmstart"][:] = 0  # so that the state alone decides what follows
         self._batch.step(nstep=SUBSTEPS)
-        self._read(world)
+        world |= self._split(torch.cat([self._numbers("qpos"), self._numbers("qvel"), rest], -1))
         torque = self._numbers("actuator_force")
         velocity, spin, _, command = self._felt(world)
         error = (velocity[..., :2] - command[..., :2]).norm(dim=-1)
@@ -147,7 +150,7 @@ class Quadruped(BatchedTask):
         return target.flatten(-2).clamp(-1, 1).unsqueeze(-2)
 
     def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
-        self.data.qpos[:] = torch.cat([self.world[name][world].flatten() for name in _POSITIONS]).cpu().numpy()
+        self.data.qpos[:] = self._parts(self._state()[world])[0].cpu().numpy()
         mujoco.mj_forward(self.model, self.data)
         picture = self._paint()
         return Scene((), (0.0, picture.shape[1], 0.0, picture.shape[0]), picture=picture)
@@ -164,23 +167,13 @@ class Quadruped(BatchedTask):
 
         return inwards(velocity), world["spin"][..., 0, :], inwards(down), world["command"][..., 0, :]
 
-    def _write(self, world: World) -> None:
-        for name, fields in (("qpos", _POSITIONS), ("qvel", _VELOCITIES)):
-            rows = torch.cat([world[field].flatten(2) for field in fields], -1)
-            self._rows[name][:] = rows.flatten(0, 1).cpu().numpy()
-        self._rows["qacc_warmstart"][:] = 0  # so that the state alone decides what follows
-
-    def _read(self, world: World) -> None:
-        for name, fields in (("qpos", _POSITIONS), ("qvel", _VELOCITIES)):
-            parts = self._numbers(name).split([world[field].shape[-1] for field in fields], -1)
-            world |= {field: part.unsqueeze(-2).contiguous() for field, part in zip(fields, parts, strict=True)}
+    def _parts(self, state: Tensor) -> tuple[Tensor, ...]:
+        """Return what states [..., width] begin with, MuJoCo's qpos and qvel, and the rest."""
+        return state.tensor_split((self.model.nq, self.model.nq + self.model.nv), -1)
 
     def _numbers(self, name: str) -> Tensor:
         rows = torch.from_numpy(self._rows[name].astype(np.float32)).to(self.device)
         return rows.unflatten(0, (self.num_seeds, self.num_envs))
-
-
-_POSITIONS, _VELOCITIES = ("place", "attitude", "positions"), ("velocity", "spin", "velocities")
 
 
 @cache
