@@ -19,6 +19,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
 from esp_cli.bodies.frame import BALL, FREE, HINGE, SLIDE, Frame, clean, image_of_axis, share
+from esp_cli.bodies.kinds import space
 from esp_cli.bodies.reading import printable
 from esp_cli.symmetry.elements import Floats, Indices
 from esp_cli.symmetry.plane import PlaneElement
@@ -54,7 +55,7 @@ class Match:
 
 def derive(frame: Frame, element: PlaneElement) -> Match:
     """Find what an element does to a model; an error names the joint or body that is without an image at rest."""
-    R = frame.image(element)
+    R = clean(frame.axes @ space(element.matrix) @ frame.axes.T)
     com = frame.com[frame.moving]
     gaps = np.linalg.norm((com @ R.T)[:, None] - com, axis=-1).min(1)
     if gaps.max() > FAR * frame.size:

@@ -112,12 +112,11 @@ def _outside(found: Mapping[PlaneElement, Found], idle: set[PlaneElement]) -> Pl
 
 def differences(frame: Frame, match: Match) -> list[Difference]:
     """Return for each joint what differs most: 0 of a joint that is the exact image of its partner's."""
-    model, R = frame.model, frame.image(match.element)
     found = []
     for i, j in enumerate(match.joint.tolist()):
-        shares = _of_joint(frame, R, i, j)
-        for a in np.flatnonzero(model.actuator_trnid[:, 0] == i):
-            if model.actuator_trntype[a] in _AT_JOINTS:
+        shares = _of_joint(frame, match.world, i, j)
+        for a in np.flatnonzero(frame.model.actuator_trnid[:, 0] == i):
+            if frame.model.actuator_trntype[a] in _AT_JOINTS:
                 shares |= _of_actuator(frame, match, int(a))
         what, most = max(shares.items(), key=lambda item: item[1])
         found.append(Difference(what if most > 1e-9 else "", most, shares))

@@ -10,9 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from esp_cli.bodies.kinds import space
 from esp_cli.symmetry.elements import Floats
-from esp_cli.symmetry.plane import PlaneElement
 from esp_envs.errors import UserError
 
 FREE, BALL, SLIDE, HINGE = range(4)  # MuJoCo's types of joints
@@ -69,10 +67,6 @@ class Frame:
         """Raise a `UserError` once the time is over."""
         if self.is_late:
             raise UserError(f"not covered: the {self._seconds:g} s for the search were over")
-
-    def image(self, element: PlaneElement) -> Floats:
-        """Return the matrix [3, 3] of an element on the world at rest."""
-        return clean(self.axes @ space(element.matrix) @ self.axes.T)
 
     def name(self, kind: str, index: int) -> str:
         """Return the name of a body, joint or actuator, made of its number where it has none."""
