@@ -77,8 +77,8 @@ def find(frame: Frame, tolerated: float) -> tuple[dict[PlaneElement, Found], dic
             if element in TRIED[:2] or frame.is_late:
                 refused[element.name] = str(error)
             continue
-        if match.unmatched:
-            refused[element.name] = f"no image was found of the actuators {', '.join(match.unmatched)}"
+        if lost := [printable(frame.name("actuator", a)) for a in np.flatnonzero(~match.ctrl.any(0)).tolist()]:
+            refused[element.name] = f"no image was found of the actuators {', '.join(lost)}"
         elif not proof.gap <= tolerated:  # nor NaN
             worst = printable(frame.name("joint", int(proof.joints.argmax())))
             refused[element.name] = f"accelerations of {worst} differ by {proof.gap:.2g} of their size"
@@ -91,9 +91,9 @@ def find(frame: Frame, tolerated: float) -> tuple[dict[PlaneElement, Found], dic
             others = *unlike_contacts(frame, match, EXACT), *_unlike_limits(frame, match, differ)
             proof = replace(proof, unlike=(*proof.unlike, *others))
             found[element] = Found(match, proof, differ, None if frame.base is None else differ[frame.base])
-    while lost := _outside(found, idle):
-        del found[lost]
-        refused[lost.name] = "its products with the other symmetries do not hold, or are not tried"
+    while wrong := _outside(found, idle):
+        del found[wrong]
+        refused[wrong.name] = "its products with the other symmetries do not hold, or are not tried"
     return found, refused
 
 

@@ -86,9 +86,8 @@ class Proof:
     @property
     def summary(self) -> dict[str, Any]:
         """The verdict and all gaps, as JSON takes them."""
-        names = ("gap", "median", "constraints", "contacts", "worst", "sensors", "unjudged", "unlike")
-        gaps = {name: getattr(self, name) for name in names}
-        return {"verdict": self.verdict, **gaps, "smallest_planted": float(self.planted.min())}
+        gaps = {name: value for name, value in vars(self).items() if name not in ("joints", "planted")}
+        return {"verdict": self.verdict, "gap": self.gap, **gaps, "smallest_planted": float(self.planted.min())}
 
     def would_show(self, planted: float) -> bool:
         """Return whether a mistake of this gap can be told from the gap that is there without one."""
