@@ -22,6 +22,11 @@ from esp_envs.errors import UserError
 from esp_envs.spec import Field, Kind, Layout
 
 SECONDS = 50.0  # processor time within which the search of a model ends
+_OF_A_BASE = {
+    "positions": {"place": slice(0, 3), "attitude": slice(3, 7)},
+    "velocities": {"velocity": slice(0, 3), "spin": slice(3, 6)},
+}
+"""Where MuJoCo's state has a base that moves freely and is first, by what the rest is called."""
 
 
 class Body:
@@ -61,16 +66,13 @@ class Body:
         limbs: Mapping[str, str] | Mapping[str, Mapping[str, str]] | None = None,
     ) -> None:
         named = named_parts("joints", joints, mirror)
-        pairs = [(k, v) for k, v in (limbs or {}).items() if isinstance(v, str)]
-        pairs += [pair for table in (limbs or {}).values() if not isinstance(table, str) for pair in table.items()]
-        ends = list(dict.fromkeys(name for pair in pairs for name in pair))
         self._numbers: dict[str, int] = {}
-        self._base: tuple[Parts, Parts] | None = None
+        self._is_free = False  # whether it has a base that moves freely
         self._stateless = "a body that is given by names has no state; make it of a model"  # why `state` has no layout
         self._is_turned = False  # whether the base's axes at rest are not the world's
         self.found: dict[str, Found] = {}
         self.refused: dict[str, str] = {}
-        self._set(named, named, named, named_parts("limbs", ends, limbs or {}))
+        self._set(named, named, named, named_parts("limbs", None, limbs or {}))
 
     def _set(self, positions: Parts, velocities: Parts, controls: Parts, limbs: Parts) -> None:
         self._positions, self._velocities, self._controls, self._limbs = positions, velocities, controls, limbs
@@ -141,13 +143,8 @@ class Body:
             Parts("limbs", limbs, {g: m.bodies for g, m in matches.items()}),
         )
         self._numbers = names
-        if frame.base is not None:
-            q, v = frame.qpos_of(frame.base).start, frame.dofs_of(frame.base).start
-            places = {"place": slice(q, q + 3), "attitude": slice(q + 3, q + 7)}
-            rates = {"velocity": slice(v, v + 3), "spin": slice(v + 3, v + 6)}
-            moves = self._positions.moves, self._velocities.moves
-            self._base = Parts("base's", places, moves[0]), Parts("base's", rates, moves[1])
-            self._is_turned = not np.allclose(frame.axes, np.eye(3), atol=1e-6)
+        self._is_free = frame.base is not None
+        self._is_turned = not np.allclose(frame.axes, np.eye(3), atol=1e-6)
         first = 0 if frame.base is None else frame.qpos_of(frame.base).start
         shifted = [n for n in names if any(np.any(m.offset[frame.qpos_of(names[n])]) for m in matches.values())]
         self._stateless = (
@@ -261,12 +258,12 @@ class Body:
         if self._stateless:
             raise UserError(self._stateless)
         fields = []
-        for k, joints in enumerate((self._positions, self._velocities)):
-            if self._base is not None:
-                base = self._base[k]
-                fields += [base.field(name, [name], 1) for name in base.places]
+        for name, joints in (("positions", self._positions), ("velocities", self._velocities)):
+            if self._is_free:
+                base = Parts("base's", _OF_A_BASE[name], joints.moves)
+                fields += [base.field(part, [part], 1) for part in base.places]
             if self.joints:
-                fields.append(joints.field(("positions", "velocities")[k], self.joints, 1))
+                fields.append(joints.field(name, self.joints, 1))
         return Layout(tuple(fields))
 
     def check_pose(self, pose: Mapping[str, float], tolerance: float = 1e-3) -> None:

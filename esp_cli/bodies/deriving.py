@@ -19,6 +19,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
 from esp_cli.bodies.frame import BALL, FREE, HINGE, SLIDE, Frame, clean, image_of_axis, share
+from esp_cli.bodies.kinds import space
 from esp_cli.bodies.reading import printable
 from esp_cli.symmetry.elements import Floats, Indices
 from esp_cli.symmetry.plane import PlaneElement
@@ -42,9 +43,8 @@ class Match:
     qpos: Floats  # [nq, nq]
     offset: Floats  # [nq]; 0 but for joints whose reference is not 0, and a base away from the origin
     qvel: Floats  # [nv, nv]
-    ctrl: Floats  # [nu, nu]
+    ctrl: Floats  # [nu, nu]; rows and columns of 0 where an actuator has no image
     tendons: Floats  # [tendons, tendons]; a column of 0 where one has no image
-    unmatched: tuple[str, ...]  # names of actuators that have no image; their rows and columns are 0
 
     @property
     def is_trivial(self) -> bool:
@@ -54,7 +54,7 @@ class Match:
 
 def derive(frame: Frame, element: PlaneElement) -> Match:
     """Find what an element does to a model; an error names the joint or body that is without an image at rest."""
-    R = frame.image(element)
+    R = clean(frame.axes @ space(element.matrix) @ frame.axes.T)
     com = frame.com[frame.moving]
     gaps = np.linalg.norm((com @ R.T)[:, None] - com, axis=-1).min(1)
     if gaps.max() > FAR * frame.size:
@@ -69,9 +69,9 @@ def derive(frame: Frame, element: PlaneElement) -> Match:
         raise UserError(f"no joint is like the image of {printable(frame.name('joint', alone))}")
     qpos, offset, qvel = _state_maps(frame, R, joints)
     every_body = _all_bodies(frame, R, bodies)
-    ctrl, tendons, unmatched = _pulled_maps(frame, every_body, qpos, offset, qvel)
+    ctrl, tendons = _pulled_maps(frame, every_body, qpos, offset, qvel)
     joint = np.array([joints[j] for j in range(frame.model.njnt)])
-    return Match(element, R, every_body, joint, qpos, offset, qvel, ctrl, tendons, unmatched)
+    return Match(element, R, every_body, joint, qpos, offset, qvel, ctrl, tendons)
 
 
 def _matched(frame: Frame, R: Floats) -> tuple[dict[int, int], dict[int, int]]:
@@ -175,10 +175,8 @@ def _pulls(frame: Frame, qpos: Floats) -> Floats:
     return np.stack(columns, 1)
 
 
-def _pulled_maps(
-    frame: Frame, bodies: Floats, qpos: Floats, offset: Floats, qvel: Floats
-) -> tuple[Floats, Floats, tuple[str, ...]]:
-    """Return the maps of controls and of tendons, by their pull at rest and in another pose; and actuators without."""
+def _pulled_maps(frame: Frame, bodies: Floats, qpos: Floats, offset: Floats, qvel: Floats) -> tuple[Floats, Floats]:
+    """Return the maps of controls and of tendons, by their pull at rest and in another pose."""
     model, rest, other = frame.model, frame.model.qpos0, frame.model.qpos0.copy()
     mujoco.mj_integratePos(model, other, 0.3 * np.random.default_rng(0).normal(size=model.nv), 1.0)
     here = np.hstack([_pulls(frame, q) @ qvel.T for q in (rest, other)])
@@ -192,7 +190,7 @@ def _pulled_maps(
     turned = np.where((model.actuator_gaintype == 0) & (model.actuator_gainprm[:, 0] < 0), -1.0, 1.0)[:, None]
     here, there = (turned * x[: model.nu] * ~on_body[:, None] for x in (here, there))
     ctrl = _images(np.hstack([here, held @ bodies.T]), np.hstack([there, held]), partial(actuator_shares, model))
-    return ctrl, tendons, tuple(printable(frame.name("actuator", a)) for a in range(model.nu) if not ctrl[:, a].any())
+    return ctrl, tendons
 
 
 def _images(here: Floats, there: Floats, unlike: Callable[[int, int, float], dict[str, float]]) -> Floats:

@@ -19,6 +19,7 @@ from esp_cli.defaults import __version__
 from esp_cli.symmetry.elements import Floats
 from esp_cli.symmetry.parse import parse_elements
 from esp_cli.symmetry.plane import PlaneElement
+from esp_cli.symmetry.representation import Operator
 from esp_envs.errors import UserError
 
 HOSTS = dict.fromkeys(("rsl_rl", "isaaclab", "mjlab"), "compute_symmetric_states")
@@ -88,7 +89,6 @@ def _filled(module: ModuleType, data: Mapping[str, object]) -> str:
 
 def _move(matrix: Floats) -> tuple[list[list[int]], list[list[float]]]:
     """Return where new numbers come from and times what, in as many terms as the widest sum has: mostly one."""
-    matrix = np.round(matrix, 12)
-    order = np.argsort(matrix == 0, axis=1, kind="stable")[:, : np.count_nonzero(matrix, axis=1).max()]
-    factor = np.take_along_axis(matrix, order, 1).T.tolist()
-    return order.T.tolist(), [[int(x) if x == int(x) else x for x in times] for times in factor]
+    terms = Operator.of_block(np.round(matrix, 12))
+    factor = terms.weight[0].T.tolist()
+    return terms.source[0].T.tolist(), [[int(x) if x == int(x) else x for x in times] for times in factor]

@@ -77,8 +77,8 @@ def find(frame: Frame, tolerated: float) -> tuple[dict[PlaneElement, Found], dic
             if element in TRIED[:2] or frame.is_late:
                 refused[element.name] = str(error)
             continue
-        if match.unmatched:
-            refused[element.name] = f"no image was found of the actuators {', '.join(match.unmatched)}"
+        if lost := [printable(frame.name("actuator", a)) for a in np.flatnonzero(~match.ctrl.any(0)).tolist()]:
+            refused[element.name] = f"no image was found of the actuators {', '.join(lost)}"
         elif not proof.gap <= tolerated:  # nor NaN
             worst = printable(frame.name("joint", int(proof.joints.argmax())))
             refused[element.name] = f"accelerations of {worst} differ by {proof.gap:.2g} of their size"
@@ -91,9 +91,9 @@ def find(frame: Frame, tolerated: float) -> tuple[dict[PlaneElement, Found], dic
             others = *unlike_contacts(frame, match, EXACT), *_unlike_limits(frame, match, differ)
             proof = replace(proof, unlike=(*proof.unlike, *others))
             found[element] = Found(match, proof, differ, None if frame.base is None else differ[frame.base])
-    while lost := _outside(found, idle):
-        del found[lost]
-        refused[lost.name] = "its products with the other symmetries do not hold, or are not tried"
+    while wrong := _outside(found, idle):
+        del found[wrong]
+        refused[wrong.name] = "its products with the other symmetries do not hold, or are not tried"
     return found, refused
 
 
@@ -112,12 +112,11 @@ def _outside(found: Mapping[PlaneElement, Found], idle: set[PlaneElement]) -> Pl
 
 def differences(frame: Frame, match: Match) -> list[Difference]:
     """Return for each joint what differs most: 0 of a joint that is the exact image of its partner's."""
-    model, R = frame.model, frame.image(match.element)
     found = []
     for i, j in enumerate(match.joint.tolist()):
-        shares = _of_joint(frame, R, i, j)
-        for a in np.flatnonzero(model.actuator_trnid[:, 0] == i):
-            if model.actuator_trntype[a] in _AT_JOINTS:
+        shares = _of_joint(frame, match.world, i, j)
+        for a in np.flatnonzero(frame.model.actuator_trnid[:, 0] == i):
+            if frame.model.actuator_trntype[a] in _AT_JOINTS:
                 shares |= _of_actuator(frame, match, int(a))
         what, most = max(shares.items(), key=lambda item: item[1])
         found.append(Difference(what if most > 1e-9 else "", most, shares))

@@ -10,9 +10,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from esp_cli.bodies.kinds import space
 from esp_cli.symmetry.elements import Floats
-from esp_cli.symmetry.plane import PlaneElement
 from esp_envs.errors import UserError
 
 FREE, BALL, SLIDE, HINGE = range(4)  # MuJoCo's types of joints
@@ -27,7 +25,9 @@ class Frame:
     Mirrors and turns leave `centre` [3] where it is; its z is 0. `axes` [3, 3] are the base's own, in columns: elements
     are told by them. `size` is the largest distance of a joint or mass from their middle, m. `places` [bodies, 2, 3]
     are origin and middle of mass of each body, without what is fixed to it, and `inertia` [bodies, 3, 3] is along the
-    world's axes. Looking for symmetries may take `seconds` of processor time.
+    world's axes; `mass` [bodies] and `com` [bodies, 3] are those of each moving body with all that is fixed to it.
+    `children` are the moving bodies that hang on each moving body, and on the world (0). Looking for symmetries may
+    take `seconds` of processor time.
     """
 
     def __init__(self, model: Any, seconds: float = math.inf) -> None:
@@ -41,9 +41,8 @@ class Frame:
         mujoco.mj_comPos(model, data)
         self.base = free[0] if free else None
         self.moving = [b for b in range(1, model.nbody) if model.body_jntnum[b]]
-        self.parent = {b: self.carrier(b) for b in self.moving}
-        roots = [b for b in self.moving if self.parent[b] == 0]
-        self.centre = data.xpos[model.jnt_bodyid[free[0]] if free else roots].reshape(-1, 3).mean(0)
+        self.children = {b: [c for c in self.moving if self.carrier(c) == b] for b in (0, *self.moving)}
+        self.centre = data.xpos[model.jnt_bodyid[free[0]] if free else self.children[0]].reshape(-1, 3).mean(0)
         self.centre[2] = 0
         self.axes = data.xmat[model.jnt_bodyid[free[0]]].reshape(3, 3).copy() if free else np.eye(3)
         self.places = np.stack([data.xpos, data.xipos], 1) - self.centre
@@ -52,7 +51,10 @@ class Frame:
         axes = data.ximat.reshape(-1, 3, 3)
         self.geom_places, self._geom_axes = data.geom_xpos - self.centre, data.geom_xmat.reshape(-1, 3, 3).copy()
         self.inertia = axes * model.body_inertia[:, None] @ axes.transpose(0, 2, 1)
-        self.mass, self.com = self._rigid_parts(data.xipos - self.centre)
+        self.mass, moment = np.zeros(model.nbody), np.zeros((model.nbody, 3))
+        np.add.at(self.mass, model.body_weldid, model.body_mass)
+        np.add.at(moment, model.body_weldid, model.body_mass[:, None] * (data.xipos - self.centre))
+        self.com = moment / np.maximum(self.mass, 1e-12)[:, None]
         spread = np.concatenate([self.anchor, self.com[self.moving]])
         self.size = max(float(np.linalg.norm(spread - spread.mean(0), axis=1).max()), 1e-6)
 
@@ -66,10 +68,6 @@ class Frame:
         if self.is_late:
             raise UserError(f"not covered: the {self._seconds:g} s for the search were over")
 
-    def image(self, element: PlaneElement) -> Floats:
-        """Return the matrix [3, 3] of an element on the world at rest."""
-        return clean(self.axes @ space(element.matrix) @ self.axes.T)
-
     def name(self, kind: str, index: int) -> str:
         """Return the name of a body, joint or actuator, made of its number where it has none."""
         return str(getattr(self.model, kind)(index).name) or f"{kind}#{index}"
@@ -81,14 +79,6 @@ class Frame:
     def carrier(self, body: int) -> int:
         """Return the moving body that a body hangs on; 0 is the world."""
         return int(self.model.body_weldid[self.model.body_parentid[body]])
-
-    def _rigid_parts(self, com: Floats) -> tuple[Floats, Floats]:
-        """Return [bodies] mass and [bodies, 3] middle of mass of each moving body with all that is fixed to it."""
-        own, owner = self.model.body_mass, self.model.body_weldid
-        mass, moment = np.zeros(len(own)), np.zeros((len(own), 3))
-        np.add.at(mass, owner, own)
-        np.add.at(moment, owner, own[:, None] * com)
-        return mass, moment / np.maximum(mass, 1e-12)[:, None]
 
     @cached_property
     def touching(self) -> Any:
@@ -123,11 +113,6 @@ class Frame:
                 (g, kind, place, axes * half**2 @ axes.T)
             )
         return found
-
-    @cached_property
-    def children(self) -> dict[int, list[int]]:
-        """The moving bodies that hang on each moving body, and on the world (0)."""
-        return {b: [c for c in self.moving if self.parent[c] == b] for b in (0, *self.moving)}
 
     def qpos_of(self, joint: int) -> slice:
         """Return where the position of a joint is."""

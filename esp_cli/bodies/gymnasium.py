@@ -52,7 +52,7 @@ class _OfModel(ParallelTask):
         if key not in self._known:
             with quiet():
                 env = self.make_one()
-                self._known[key] = self._layouts(env), float(self._robot(env).dt)
+                self._known[key] = self._layouts(env), float(env.unwrapped.dt)
             env.close()
         known, self.control_period_s = self._known[key]
         self.observation, self.action, self.simulated = known.observation, known.action, known.simulated
@@ -60,10 +60,6 @@ class _OfModel(ParallelTask):
         found = ",".join(element.name for element in held) or "c1"
         self.symmetry, self.nearly = (found, "") if self.exact else ("c1", found)
         super().__init__(settings, num_envs, generators)
-
-    def _robot(self, env: Any) -> Any:
-        """Return Gymnasium's environment of the robot of a copy."""
-        return env.unwrapped
 
     def _layouts(self, env: Any) -> Layouts:
         """Return the layouts of a copy, which may be overwritten."""
@@ -104,21 +100,17 @@ class MujocoTeam(_OfModel):
     def make_one(self) -> Any:
         make = _module("gymnasium_robotics").mamujoco_v1.parallel_env
         env = make(self.scenario, self.parts, max_episode_steps=self.settings.horizon, **self.arguments)
-        robot = self._robot(env)
-        # where checks and pictures look for them
-        env.data, env.model, env.set_state = robot.data, robot.model, robot.set_state
+        robot = env.single_agent_env.unwrapped
+        for name in ("data", "model", "set_state", "dt"):  # where checks and pictures look for them
+            setattr(env, name, getattr(robot, name))
         env.render_mode, env.render = "rgb_array", painter_of(robot)
         return env
 
-    def _robot(self, env: Any) -> Any:
-        return env.single_agent_env.unwrapped
-
     def _layouts(self, env: Any) -> Layouts:
-        agents, count = env.possible_agents, env.model.nu
-        width = count // len(agents)
-        acts = [np.arange(width) + width * k for k in range(len(agents))]
-        whole = env.map_local_actions_to_global_action(dict(zip(agents, np.array(acts, float), strict=True)))
-        acting = np.argsort(whole).reshape(len(agents), width)
+        agents = env.possible_agents
+        acts = np.arange(float(env.model.nu)).reshape(len(agents), -1)
+        whole = env.map_local_actions_to_global_action(dict(zip(agents, acts, strict=True)))
+        acting = np.argsort(whole).reshape(acts.shape)
         return layouts_of(Body.from_mjcf(env.model), env.data, lambda: list(env._get_obs().values()), acting.tolist())
 
 

@@ -81,11 +81,9 @@ class PartsKind(Kind):
 
     def matrix(self, planar: Floats) -> Floats:
         """Return how the numbers of one item transform under a matrix of the plane that is a symmetry of the body."""
-        for element, rows in self.moves:
+        for element, rows in (*self.moves, (PlaneElement(), np.eye(self.width))):
             if np.allclose(element.matrix, planar, atol=1e-9):
                 return np.array(rows)
-        if np.allclose(planar, np.eye(2), atol=1e-9):
-            return np.eye(self.width)
         known = ", ".join(element.name for element, _ in self.moves)
         if not known:
             raise UserError(f"the body has no symmetry for its {self.name}")
@@ -181,14 +179,17 @@ class Parts:
         return parts_field(name, self.what, [part for part in owner for _ in range(width)], moves, history)
 
 
-def named_parts(what: str, names: Sequence[str], tables: Mapping[str, Any]) -> Parts:
-    """Return parts of one number each, with what tables of names say, and their products.
+def named_parts(what: str, names: Sequence[str] | None, tables: Mapping[str, Any]) -> Parts:
+    """Return parts of one number each, by default those of the tables, with what tables say, and their products.
 
     A table, or one by element, holds by part its image, with "-" where the sign changes, or follows from its partner.
     """
-    names = _listed(f"the list of {what}", names)
     if not isinstance(tables, Mapping) or (tables and all(isinstance(value, str) for value in tables.values())):
         tables = {"left-right": tables}
+    if names is None:
+        named = [pair for table in tables.values() if isinstance(table, Mapping) for pair in table.items()]
+        names = list(dict.fromkeys(name for pair in named for name in pair))
+    names = _listed(f"the list of {what}", names)
     generators = {_element_of(word): _matrix(what, names, table) for word, table in tables.items()}
     group = FiniteGroup.generated_by("the body", list(generators))
     moves: dict[PlaneElement, Floats] = {PlaneElement(): np.eye(len(names))}

@@ -10,6 +10,7 @@ return {
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 from esp_cli.bodies.body import Body
@@ -48,14 +49,11 @@ def numbers_of(body: Body, order: str | None) -> Numbers:
 
 def _lines(path: Path) -> list[str]:
     """Return the joint names of a file, one a line."""
-    try:
-        content = read_regular(path, _MOST_BYTES)
-        names = "" if content is None else content.decode()
-    except UnicodeDecodeError:
-        names = ""
-    if not names.split():
-        raise UserError(f"{path} is no list of joints; write their names in your simulator's order, one a line")
-    return [line.strip() for line in names.splitlines() if line.strip()]
+    with suppress(UnicodeDecodeError):
+        lines = (read_regular(path, _MOST_BYTES) or b"").decode().splitlines()
+        if names := [line.strip() for line in lines if line.strip()]:
+            return names
+    raise UserError(f"{path} is no list of joints; write their names in your simulator's order, one a line")
 
 
 def map_of(numbers: Layout, element: PlaneElement) -> Floats:

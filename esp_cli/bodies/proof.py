@@ -86,9 +86,8 @@ class Proof:
     @property
     def summary(self) -> dict[str, Any]:
         """The verdict and all gaps, as JSON takes them."""
-        names = ("gap", "median", "constraints", "contacts", "worst", "sensors", "unjudged", "unlike")
-        gaps = {name: getattr(self, name) for name in names}
-        return {"verdict": self.verdict, **gaps, "smallest_planted": float(self.planted.min())}
+        gaps = {name: value for name, value in vars(self).items() if name not in ("joints", "planted")}
+        return {"verdict": self.verdict, "gap": self.gap, **gaps, "smallest_planted": float(self.planted.min())}
 
     def would_show(self, planted: float) -> bool:
         """Return whether a mistake of this gap can be told from the gap that is there without one."""
@@ -111,30 +110,24 @@ def prove(frame: Frame, match: Match, seed: int = 0) -> Proof:
     """Compare accelerations of states and of their images, and of planted mistakes."""
     rng, data = np.random.default_rng(seed), mujoco.MjData(frame.model)
     samples = [_state(frame, data, rng) for _ in range(_STATES)]
-    images = _images(match, samples)
-    here, there = (_accelerations(frame, data, states, _NO_CONSTRAINTS) for states in (samples, images))
+    here, there = (_accelerations(frame, data, some, _NO_CONSTRAINTS) for some in (samples, _images(match, samples)))
 
     def mistaken(wrong: Match) -> float:
         seen = _accelerations(frame, data, _images(wrong, samples[:_PLANTED]), _NO_CONSTRAINTS | _NO_SENSORS)
         return float(_gaps(frame, wrong, here[:_PLANTED], seen)[0].max())
 
+    def compared(states: list[Sample], disabled: int) -> tuple[Floats, Floats]:
+        """Return the gaps of joints and of states without what the flags disable."""
+        pair = (_accelerations(frame, data, some, disabled | _NO_SENSORS) for some in (states, _images(match, states)))
+        return _gaps(frame, match, *pair)
+
     joints, free = _gaps(frame, match, here, there)
     if frame.model.neq:
-        joined, tied = (_accelerations(frame, data, states, _NO_LIMITS | _NO_SENSORS) for states in (samples, images))
-        joints = np.maximum(joints, _gaps(frame, match, joined, tied)[0])
+        joints = np.maximum(joints, compared(samples, _NO_LIMITS)[0])
     planted = [min(mistaken(wrong) for wrong in _mistakes(frame, match, joint)) for joint in range(frame.model.njnt)]
-    lowered = [_lowered(frame, data, sample) for sample in samples[:_LYING]]
-    lying = [sample for sample in lowered if sample is not None]
-    pairs = [
-        [_accelerations(frame, data, states, flag | _NO_SENSORS) for states in (some, moved)]
-        for some, moved, flag in (
-            (samples, images, _NO_CONTACTS),
-            (samples, images, 0),
-            (lying, _images(match, lying), 0),
-        )
-        if some
-    ]
-    held = [_gaps(frame, match, *pair)[1] for pair in pairs]
+    lying = [low for sample in samples[:_LYING] if (low := _lowered(frame, data, sample)) is not None]
+    cases = [(samples, _NO_CONTACTS), (samples, 0), (lying, 0)]
+    held = [compared(states, disabled)[1] for states, disabled in cases if states]
     median, *medians = (float(np.median(gaps)) for gaps in (free, *held))
     worst = float(np.concatenate(held).max())
     sensors, unjudged, unlike = _sensors(frame, here, there)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import warnings
 from collections.abc import Iterator
@@ -95,25 +96,22 @@ def _inspected(path: Path, allowed: Path) -> str:
     folders = {folder for folder, _ in trees}
     told = {x for _, tree in trees for c in tree.iter("compiler") for x in c.attrib.values() if x}
     folders |= {path.parent / _short(path, x) for x in told}
-    elements = 0
-    for _, tree in trees:
-        waiting = [(tree, 1, 1)]
-        while waiting:
-            element, times, depth = waiting.pop()
-            if element.tag in _COUNTED:
-                for word in element.attrib.get("count", "1").split():
-                    times *= _whole(word)
-            elements += times
-            if elements > MOST_ELEMENTS or depth > MOST_DEPTH:
-                raise UserError(f"{path} has more than {MOST_ELEMENTS} elements, or nests too deep")
-            for key, value in element.attrib.items():
-                if key.startswith("file"):
-                    for found in _files(path, value, folders, allowed):
-                        _check_size(found, ASSET_MIB)
-                limit = next((most for name, most in _LIMITS.items() if key.startswith(name)), None)
-                if limit is not None and max(map(_whole, value.split()), default=0) > limit:
-                    raise UserError(f"{path}: {key}={value[:40]!r} is more than {limit}; give a smaller one")
-            waiting += [(child, times, depth + 1) for child in element]
+    elements, waiting = 0, [(tree, 1, 1) for _, tree in reversed(trees)]
+    while waiting:
+        element, times, depth = waiting.pop()
+        if element.tag in _COUNTED:
+            times *= math.prod(map(_whole, element.attrib.get("count", "1").split()))
+        elements += times
+        if elements > MOST_ELEMENTS or depth > MOST_DEPTH:
+            raise UserError(f"{path} has more than {MOST_ELEMENTS} elements, or nests too deep")
+        for key, value in element.attrib.items():
+            if key.startswith("file"):
+                for found in _files(path, value, folders, allowed):
+                    _check_size(found, ASSET_MIB)
+            limit = next((most for name, most in _LIMITS.items() if key.startswith(name)), None)
+            if limit is not None and max(map(_whole, value.split()), default=0) > limit:
+                raise UserError(f"{path}: {key}={value[:40]!r} is more than {limit}; give a smaller one")
+        waiting += [(child, times, depth + 1) for child in element]
     return tag
 
 

@@ -71,12 +71,11 @@ def _names(body: Body, model: Any) -> list[tuple[str, str]]:
 def _sources(data: Any, observe: Callable[[], Sequence[Floats]]) -> list[Indices]:
     """Return for each agent where each number that it sees stands among the simulator's arrays."""
     # below 1 in size, since environments clip what is larger
-    drawn = np.random.default_rng(0).uniform(-1, 1, sum(getattr(data, name).size for name in _SHOWN))
-    start = 0
-    for name in _SHOWN:
-        array = getattr(data, name)
-        array[...] = drawn[start : start + array.size].reshape(array.shape)
-        start += array.size
+    arrays = [getattr(data, name) for name in _SHOWN]
+    ends = np.cumsum([array.size for array in arrays])
+    drawn = np.random.default_rng(0).uniform(-1, 1, ends[-1])
+    for array, part in zip(arrays, np.split(drawn, ends[:-1]), strict=True):
+        array.flat = part
     where, found = {number: k for k, number in enumerate(drawn.tolist())}, []
     for row in observe():
         places = [where.get(float(number)) for number in np.ravel(row)]

@@ -86,30 +86,24 @@ class Quadruped(BatchedTask):
 
     def _start(self, generator: torch.Generator) -> World:
         drawn = self.draw(19, generator=generator)
-        phase = math.pi * drawn[:, 18:]
-        zeros = torch.zeros(self.num_envs, 12, device=self.device)
+        phase, still = math.pi * drawn[:, 18:], torch.zeros(self.num_envs, 27, device=self.device)
         most = torch.tensor([self.settings.speed, self.settings.speed / 2, self.settings.turning], device=self.device)
         upright = torch.tensor([0, 0, HEIGHT_M, 1, 0, 0, 0], device=self.device).expand(self.num_envs, 7)
-        parts = {
-            "place": upright[:, :3],
-            "attitude": upright[:, 3:],
-            "positions": 0.1 * drawn[:, :12],
-            "velocity": 0.2 * drawn[:, 12:15],
-            "spin": zeros[:, :3],
-            "velocities": zeros,
-            "before": zeros,
-            "command": most * drawn[:, 15:18],
-        }
-        clock = torch.stack([phase.cos(), phase.sin()], -2)
-        return {name: value.unsqueeze(-2).contiguous() for name, value in parts.items()} | {"clock": clock}
+        # as the state has them: place and attitude, positions, velocity, all that is still, command and clock
+        angles, velocity = 0.1 * drawn[:, :12], 0.2 * drawn[:, 12:15]
+        parts = [upright, angles, velocity, still, most * drawn[:, 15:18], phase.cos(), phase.sin()]
+        return self._split(torch.cat(parts, -1))
 
     def _advance(self, world: World, action: Tensor) -> Outcome:
         action = action.flatten(2)
         change = action - world["before"].flatten(2)
-        self._write(world)
-        self._rows["ctrl"][:] = (SWING_RAD * action).flatten(0, 1).cpu().numpy()
+        qpos, qvel, rest = self._parts(self._state())
+        sent = {"qpos": qpos, "qvel": qvel, "ctrl": SWING_RAD * action}
+        for name, rows in sent.items():
+            self._rows[name][:] = rows.flatten(0, 1).cpu().numpy()
+        self._rows["qacc_warmstart"][:] = 0  # so that the state alone decides what follows
         self._batch.step(nstep=SUBSTEPS)
-        self._read(world)
+        world |= self._split(torch.cat([self._numbers("qpos"), self._numbers("qvel"), rest], -1))
         torque = self._numbers("actuator_force")
         velocity, spin, _, command = self._felt(world)
         error = (velocity[..., :2] - command[..., :2]).norm(dim=-1)
@@ -156,7 +150,7 @@ class Quadruped(BatchedTask):
         return target.flatten(-2).clamp(-1, 1).unsqueeze(-2)
 
     def scene(self, world: tuple[int, int] = (0, 0)) -> Scene:
-        self.data.qpos[:] = torch.cat([self.world[name][world].flatten() for name in _POSITIONS]).cpu().numpy()
+        self.data.qpos[:] = self._parts(self._state()[world])[0].cpu().numpy()
         mujoco.mj_forward(self.model, self.data)
         picture = self._paint()
         return Scene((), (0.0, picture.shape[1], 0.0, picture.shape[0]), picture=picture)
@@ -173,23 +167,13 @@ class Quadruped(BatchedTask):
 
         return inwards(velocity), world["spin"][..., 0, :], inwards(down), world["command"][..., 0, :]
 
-    def _write(self, world: World) -> None:
-        for name, fields in (("qpos", _POSITIONS), ("qvel", _VELOCITIES)):
-            rows = torch.cat([world[field].flatten(2) for field in fields], -1)
-            self._rows[name][:] = rows.flatten(0, 1).cpu().numpy()
-        self._rows["qacc_warmstart"][:] = 0  # so that the state alone decides what follows
-
-    def _read(self, world: World) -> None:
-        for name, fields in (("qpos", _POSITIONS), ("qvel", _VELOCITIES)):
-            parts = self._numbers(name).split([world[field].shape[-1] for field in fields], -1)
-            world |= {field: part.unsqueeze(-2).contiguous() for field, part in zip(fields, parts, strict=True)}
+    def _parts(self, state: Tensor) -> tuple[Tensor, ...]:
+        """Return what states [..., width] begin with, MuJoCo's qpos and qvel, and the rest."""
+        return state.tensor_split((self.model.nq, self.model.nq + self.model.nv), -1)
 
     def _numbers(self, name: str) -> Tensor:
         rows = torch.from_numpy(self._rows[name].astype(np.float32)).to(self.device)
         return rows.unflatten(0, (self.num_seeds, self.num_envs))
-
-
-_POSITIONS, _VELOCITIES = ("place", "attitude", "positions"), ("velocity", "spin", "velocities")
 
 
 @cache

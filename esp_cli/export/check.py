@@ -37,12 +37,6 @@ class Sample:
     action: Numbers  # [B] or [B, width]
     after: Floats  # [B, H], the next memory
 
-    @property
-    def choosable(self) -> Floats:
-        """Outputs as the policy chooses among them: those of forbidden actions are out of reach."""
-        mask = None if self.mask is None else torch.from_numpy(self.mask)
-        return masked(torch.from_numpy(self.outputs), mask).numpy()
-
 
 Runner = Callable[[Sample], tuple[Numbers, Numbers, Numbers]]
 """What observation, memory, mask and sets of a sample come to: action, outputs and next memory."""
@@ -104,7 +98,9 @@ def compare(sample: Sample, runner: Runner) -> Agreement:
     differing = np.zeros(len(sample.obs), bool)
     if chooses:
         differing = action != sample.action
-        first, second = np.sort(sample.choosable[differing], 1)[:, ::-1][:, :2].T
+        mask = None if sample.mask is None else torch.from_numpy(sample.mask)
+        choosable = masked(torch.from_numpy(sample.outputs), mask).numpy()  # forbidden actions are out of reach
+        first, second = np.sort(choosable[differing], 1)[:, ::-1][:, :2].T
         ties = bool((first - second <= 2 * TOLERANCE * largest).all())
     else:
         gap = max(gap, float(np.abs(action - sample.action).max()))

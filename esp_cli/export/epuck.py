@@ -5,8 +5,6 @@ Untested on hardware. What builds an observation from poses is compared with the
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,19 +23,9 @@ _JITTER_M = 0.001  # noise on the task's positions: in a perfect square two robo
 _EXACT = {"sensor_noise_m": 0.0, "heading_noise_rad": 0.0}  # of a robot's sensors in training, which poses do not show
 
 
-def seen_robots(settings: Mapping[str, Any]) -> int:
-    """Return how many other robots an observation shows."""
-    return min(settings["neighbours"], settings["num_agents"] - 1)
-
-
-@dataclass(frozen=True)
-class Scenes:
-    """States of the task and what the robots see in them."""
-
-    poses: Floats  # [W, N, 3] x, y, heading
-    goals: Floats  # [W, N, 2]
-    pillars: Floats  # [W, M, 2]
-    observations: Floats  # [W, N, D] of the task, without its noise
+Scenes = tuple[Floats, ...]
+"""States of the task and what robots see in them: poses [W, N, 3] (x, y, heading), goals [W, N, 2], pillars [W, M, 2]
+and the task's observations without its noise [W, N, D]."""
 
 
 @torch.no_grad()
@@ -53,11 +41,11 @@ def take_scenes(trained: TrainedPolicy, count: int = STATES) -> Scenes:
         for _ in range(5):
             action, memory = trained.policy.act(observation.obs, memory)
             observation = played.step(action).next
-    return Scenes(*(np.concatenate(arrays)[:count] for arrays in zip(*parts, strict=True)))
+    return tuple(np.concatenate(arrays)[:count] for arrays in zip(*parts, strict=True))
 
 
-def _probe(env: Environment, state: Floats, rng: np.random.Generator, near: bool) -> tuple[Floats, ...]:
-    """Return poses, goals, pillars and observations of states near the given ones, or drawn anywhere."""
+def _probe(env: Environment, state: Floats, rng: np.random.Generator, near: bool) -> Scenes:
+    """Return scenes of states near the given ones, or drawn anywhere."""
     where, rows = env.spec.state.slices(), state.copy()
     reach = float(str(env.spec.settings["arena_m"])) / 2
     for name in ("position", "goals", "obstacles"):
@@ -80,9 +68,9 @@ def _probe(env: Environment, state: Floats, rng: np.random.Generator, near: bool
 
 def compare_scenes(scenes: Scenes, description: dict[str, Any]) -> float:
     """Return the largest difference between the task's observations and those that a pilot builds from poses."""
-    pilot = Pilot(description, lambda obs: obs)
-    states = zip(scenes.poses, scenes.goals, scenes.pillars, strict=True)
-    gap = float(np.abs(np.stack([pilot.observations(*state) for state in states]) - scenes.observations).max())
+    pilot, (*states, shown) = Pilot(description, lambda obs: obs), scenes
+    built = [pilot.observations(*state) for state in zip(*states, strict=True)]
+    gap = float(np.abs(np.stack(built) - shown).max())
     if not gap <= TOLERANCE:
         raise RuntimeError(f"an observation built from poses differs from the task's by {gap:g}; this is a bug")
     return gap

@@ -126,7 +126,7 @@ def export_all(
 def _made(trained: TrainedPolicy, formats: Sequence[str]) -> tuple[Exported, Files]:
     """Make the files of an export and check each format; nothing is written yet."""
     formats = tuple(dict.fromkeys(formats))
-    program = program_of(trained.policy, trained.spec.masks)
+    program = program_of(trained.policy)
     sample = take_sample(trained, program)
     description = describe(trained, program, sample)
     drives = "robot" in description and "numpy" in formats and not program.memory_width
@@ -190,7 +190,7 @@ def _checked(name: str, files: Files, job: Job) -> Export:
 
 
 def _readme(job: Job, results: Sequence[Export]) -> bytes:
-    settings, example = job.trained.spec.settings, job.description["example"]
+    example = job.description["example"]
     readme = filled(
         "README.md",
         **job.words,
@@ -198,6 +198,5 @@ def _readme(job: Job, results: Sequence[Export]) -> bytes:
         results=results,
         states=epuck.STATES,
         robot=None if job.scenes is None else job.description["robot"],
-        seen_robots=0 if job.scenes is None else epuck.seen_robots(settings),
     )
     return c_file.of_role(readme, job.trained.role)

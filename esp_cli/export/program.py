@@ -77,28 +77,22 @@ class Program:
         return vars(self) | {"layers": [layer.describe() for layer in self.layers]}
 
 
-def program_of(policy: Policy, masked: bool = False) -> Program:
-    """Return the program of a policy with a single seed, of a task with masks of allowed actions or without."""
+def program_of(policy: Policy) -> Program:
+    """Return the program of a policy with a single seed."""
     actor, head = policy.actor, policy.head
     sums: list[Layer] = []
     if isinstance(actor, Separate):  # the sums of an action's parts are one more layer
         parts = _plain(actor.parts)
         actor, sums = actor.network, [layers.affine(parts, np.zeros(parts.shape[1], np.float32))]
-    previous = policy.head.num_outputs if isinstance(policy, HistoryPolicy) and policy.recurrent else 0
+    previous = head.num_outputs if isinstance(policy, HistoryPolicy) and policy.recurrent else 0
     own, sets = _sets(actor, previous) if isinstance(actor, SetNetwork | RecurrentSetNetwork) else (_network(actor), {})
     groups: list[int] = []
     if isinstance(head, BoundedGaussian | BoundedPoint):  # blocks of ones, in which a row's first one is the first row
         groups = head.disc.argmax(1).unique(return_counts=True)[1].tolist()
     elif not isinstance(head, Categorical | ExploringCategorical | EpsilonGreedy):
         raise UserError(f"a head of the kind {type(head).__name__} cannot be exported")
-    if isinstance(actor, MessagePassing):
-        read = max(actor.picture.stop, actor.others.stop)
-    elif sets:
-        read = len(sets["own"])
-    else:
-        read = next(len(layer.arrays[0]) for layer in own if layer.kind == "affine") - previous
     return Program(
-        num_inputs=read,
+        num_inputs=len(sets["own"]) if sets else policy.num_observed,
         layers=(*own, *sums),
         num_outputs=head.num_outputs,
         hidden=actor.memory_width,
@@ -106,7 +100,7 @@ def program_of(policy: Policy, masked: bool = False) -> Program:
         head="squash" if groups else "choose",
         groups=groups,
         team=actor.team,
-        masked=masked,
+        masked=head.masks,
         **sets,
     )
 

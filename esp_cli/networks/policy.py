@@ -34,7 +34,7 @@ class Policy(nn.Module):
     ) -> None:
         super().__init__()
         self.num_seeds = len(generators)
-        self.num_agents = spec.num_agents
+        self.num_agents, self.num_observed = spec.num_agents, spec.observation.width
         self.head = head
         head.masks = spec.masks
         head.compiled = getattr(network, "compiled", False) is True and not getattr(network, "layer_norm", False)

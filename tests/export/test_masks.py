@@ -84,7 +84,7 @@ def _run_calls(page: str, example: dict) -> None:
 
 def test_an_export_that_ignores_masks_is_found() -> None:
     trained = drawn_policy("masked choice")
-    sample = take_sample(trained, program_of(trained.policy, masked=True), 400)
+    sample = take_sample(trained, program_of(trained.policy), 400)
     assert sample.mask is not None
     assert not sample.mask.all()
     free = sample.outputs.argmax(-1)
@@ -93,7 +93,7 @@ def test_an_export_that_ignores_masks_is_found() -> None:
 
 
 def test_a_mask_is_asked_for_and_has_a_shape() -> None:
-    program = program_of(drawn_policy("masked choice").policy, masked=True)
+    program = program_of(drawn_policy("masked choice").policy)
     policy, obs = NumpyPolicy(program.describe(), program.weights), np.zeros((2, 4), np.float32)
     with pytest.raises(ValueError, match=r"has shape \(\), but \(2, 5\) is needed"):
         policy.act(obs)
@@ -106,7 +106,7 @@ def test_a_mask_is_asked_for_and_has_a_shape() -> None:
 @needs_cc
 @torch.no_grad()
 def test_agents_that_exchange_messages_choose_among_allowed_actions(tmp_path: Path) -> None:
-    program = program_of(drawn_policy("team").policy, masked=True)
+    program = replace(program_of(drawn_policy("team").policy), masked=True)
     rng = np.random.default_rng(0)
     rows = rng.standard_normal((6 * program.team, program.num_inputs)).astype(np.float32)
     memory = np.zeros((len(rows), 0), np.float32)
