@@ -12,7 +12,6 @@ from esp_envs.adapters import foreign
 from esp_envs.adapters.copies import FINAL, NOW, TERMINATED, TRUNCATED, Board
 from esp_envs.adapters.hooks import Copy, CopyHooks
 from esp_envs.errors import UserError
-from esp_envs.roles import of_role
 from esp_envs.spec import Discrete
 
 
@@ -93,8 +92,8 @@ class CopyStepper:
             of_task = f"of {type(task).__name__}"
             raise UserError(f"'step' gives {missing[0]} {of_task} no observation; give one to all that have not ended")
         paid = {name: self._paid(name, reward, name in ended and name not in seen) for name in acting}
-        shared = self._shared(paid)
-        board.reward[k] = [paid.get(name, shared.get(task.role_of(name), 0.0)) for name in copy.learners]
+        shared = self._shared(copy, paid)
+        board.reward[k] = [paid.get(name, shared.get(kind.name, 0.0)) for name, kind in copy.kinds.items()]
         over = [name for name in acting if name in ended or name in cut]
         if over and len(over) < len(acting) and not task.agents_end:
             raise UserError(
@@ -117,15 +116,15 @@ class CopyStepper:
             for seen_by in (board.obs, board.state, board.mask, board.alive):
                 seen_by[NOW, k] = seen_by[FINAL, k]
 
-    def _shared(self, paid: Mapping[Any, float]) -> dict[str, float]:
+    def _shared(self, copy: Copy, paid: Mapping[Any, float]) -> dict[str, float]:
         """Return the rewards that agents share, by role, after checking that they are the same."""
-        task, shared = self._task, dict[str, float]()
-        for name, reward in paid.items():
-            role = task.role_of(name)
-            if not of_role(task.shared_reward, role, False):
+        shared = dict[str, float]()
+        for kind, reward in ((copy.kinds[name], reward) for name, reward in paid.items()):
+            if not kind.shared_reward:
                 continue
-            if not np.allclose(reward, shared.setdefault(role, reward), 1e-5, 1e-8, equal_nan=True):
-                raise UserError(f"agents of {type(task).__name__} get different rewards; leave out 'shared_reward'")
+            if not np.allclose(reward, shared.setdefault(kind.name, reward), 1e-5, 1e-8, equal_nan=True):
+                of_task = f"of {type(self._task).__name__}"
+                raise UserError(f"agents {of_task} get different rewards; leave out 'shared_reward'")
         return shared
 
     def _require_metrics(self, k: int) -> None:
@@ -176,10 +175,9 @@ class CopyStepper:
         if task.masks:
             over = when == FINAL and board.ended[k] > 0
             with copy.naming("allowed", k):
-                for i, name in enumerate(copy.learners):
-                    row = np.ones(board.mask.shape[-1], np.float32)
-                    action = task.action_of(name)
-                    if alive[i] and task.masks_of(name) and isinstance(action, Discrete):
+                for i, (name, kind) in enumerate(copy.kinds.items()):
+                    row, action = np.ones(board.mask.shape[-1], np.float32), kind.action
+                    if alive[i] and kind.masks and isinstance(action, Discrete):
                         allowed = task.allowed(name, seen[name], infos.get(name, {}))
                         row[: action.count] = foreign.numbers(allowed, f"the mask of {name}", action.count)
                         row[action.count :] = 0
@@ -189,7 +187,7 @@ class CopyStepper:
         if self._simulated:
             state = copy.take()
         else:
-            rows = zip(board.obs[when, k], copy.learners, strict=True)
-            own = [row[: task.layout_of(name).width] for row, name in rows]
+            rows = zip(board.obs[when, k], copy.kinds.values(), strict=True)
+            own = [row[: kind.observation.width] for row, kind in rows]
             state = np.concatenate(own) if task.state is None else copy.state(k)
         board.state[when, k] = foreign.numbers(state, "the state", board.state.shape[-1])
