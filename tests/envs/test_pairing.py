@@ -103,6 +103,38 @@ class Placed(Tri):
         env.place = state.astype(float)
 
 
+class Both:
+    """Two points in a list, which share an action space of two parts."""
+
+    action_space = gymnasium.spaces.Tuple((Point.action_space, Point.action_space))
+
+    def __init__(self):
+        self.points = [Point(), Point()]
+
+    def reset(self, seed=None, options=None):
+        return [point.reset(seed)[0] for point in self.points], {}
+
+    def step(self, actions):
+        seen = [point.step(action)[0] for point, action in zip(self.points, actions, strict=True)]
+        return seen, 0.0, False, False, {}
+
+
+class BothPlaced(ParallelTask):
+    observation, action, symmetry, convention = layout(Field("place", Kind.VECTOR)), FORCE, "d4", "two points"
+    simulated = layout(Field("places", Kind.VECTOR, 2, items=Items.AGENTS))
+
+    def make_one(self):
+        return Both()
+
+    def take(self, env):
+        return np.concatenate([point.place for point in env.points])
+
+    def put(self, env, state):
+        assert isinstance(env, Both)
+        for point, place in zip(env.points, state.reshape(2, 2).astype(float), strict=True):
+            point.place = place
+
+
 class Sliding(Point):
     """What it does to its speed, which nobody sees, moves it."""
 
@@ -151,6 +183,13 @@ def worlds(cls: type[Environment], num_envs: int = 8, **settings) -> Environment
 
 def report(cls: type[Environment], transforms: str):
     return check_symmetry(lambda n, seeds: cls(cls.Settings(), n, generators_for(seeds)), transforms)
+
+
+def test_a_task_takes_and_puts_the_environment_that_it_made_where_agents_are_parts_of_spaces() -> None:
+    env = worlds(BothPlaced, 2)
+    state = env.reset().state + 0.5
+    assert torch.allclose(env.set_state(state).state, state)
+    assert torch.allclose(env.step(torch.zeros(1, 2, 2, 2)).next.obs.flatten(2), state)
 
 
 @pytest.mark.parametrize("workers", [0, 2])

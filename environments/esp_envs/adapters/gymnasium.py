@@ -26,6 +26,3 @@ class SingleAgentTask(ParallelTask):
         single = self.make_single()
         foreign.require_kind(single, foreign.SINGLE, "make_single")
         return foreign.ByAgent(single)
-
-    def own_of(self, env: Any) -> Any:
-        return env.own

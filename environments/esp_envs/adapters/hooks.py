@@ -12,7 +12,7 @@ import numpy as np
 from esp_envs.adapters import foreign
 from esp_envs.adapters.pairing import Array, Attributes, Simulator
 from esp_envs.errors import UserError
-from esp_envs.roles import of_role
+from esp_envs.roles import Role, of_role
 from esp_envs.spec import ActionSpace, Discrete, Layout
 
 
@@ -67,29 +67,21 @@ class CopyHooks(ABC):
             return next((role for role, agents in self.roles.items() if agent in agents), "")
         return max((role for role in self.role_names if str(agent).startswith(role)), key=len, default="")
 
-    def layout_of(self, agent: Any) -> Layout:
-        """Return what a learning agent sees."""
-        given = self.observation
-        return given[self.role_of(agent)] if isinstance(given, Mapping) else given
-
-    def action_of(self, agent: Any) -> ActionSpace:
-        """Return what a learning agent does."""
-        return self.action[self.role_of(agent)] if isinstance(self.action, Mapping) else self.action
-
-    def masks_of(self, agent: Any) -> bool:
-        """Return whether a learning agent has masks."""
-        return of_role(self.masks, self.role_of(agent), False)
+    def kind_of(self, agent: Any) -> Role:
+        """Return what a learning agent sees, does and gets, as the role of one."""
+        role = self.role_of(agent)
+        given = {name: getattr(self, name) for name in ("observation", "action", "shared_reward", "masks")}
+        return Role(name=role, num_agents=1, **{name: of_role(value, role, False) for name, value in given.items()})
 
     @abstractmethod
     def make_one(self) -> Any:
         """Return one new copy, a PettingZoo `ParallelEnv`."""
 
-    def own_of(self, env: Any) -> Any:
-        """Return what `take` and `put` are given: the environment that the task itself made."""
-        return env
-
     def take(self, env: Any) -> Array:
-        """Return the numbers of `simulated`: all that decides what follows, up to chance and what `reset` drew."""
+        """Return the numbers of `simulated`: all that decides what follows, up to chance and what `reset` drew.
+
+        `env` is what the task itself made, without the wrapper that shows a Gymnasium environment's agents by name.
+        """
         raise NotImplementedError
 
     def put(self, env: Any, state: Array) -> None:
@@ -106,7 +98,7 @@ class CopyHooks(ABC):
         """
         given = observation["observation"] if _has(observation, "action_mask") else observation
         if isinstance(given, Mapping):
-            names = [field.name for field in self.layout_of(agent).fields]
+            names = [field.name for field in self.kind_of(agent).observation.fields]
             if missing := next((name for name in names if name not in given), None):
                 raise UserError(
                     f"{agent} sees {', '.join(map(str, given))}, and the layout has '{missing}'; name fields as the "
@@ -156,6 +148,7 @@ class Copy:
         of_several = isinstance(getattr(getattr(env, "action_space", None), "spaces", None), Sequence)
         self.env = foreign.ByAgent(env, alone=False) if of_several and not hasattr(env, "possible_agents") else env
         foreign.require_kind(self.env, foreign.PARALLEL, "make_one")
+        self._own = self.env.own if isinstance(self.env, foreign.ByAgent) else self.env
         self.agents = list(self.env.possible_agents)
         listed = ", ".join(map(str, self.agents)) or "none"
         groups = {role: [name for name in self.agents if task.role_of(name) == role] for role in task.role_names}
@@ -171,7 +164,8 @@ class Copy:
             raise UserError("'possible_agents' names an agent twice; give each a name of its own")
         self.rest = [name for name in self.agents if name not in self.learners]
         self.simulator = Simulator(self.env, groups or {"": self.learners}, task.attributes)
-        self._width = max(task.layout_of(name).width for name in self.learners)
+        self.kinds = {name: task.kind_of(name) for name in self.learners}
+        self._width = max(kind.observation.width for kind in self.kinds.values())
         spaces = [foreign.space_of(self.env, name) for name in self.learners]
         self._boxes = [foreign.bounds_of(space) for space in spaces]
         starts = [getattr(space, "start", 0) for space in spaces]
@@ -192,7 +186,7 @@ class Copy:
     def see(self, name: Any, observation: Any) -> Array:
         """Return the numbers of the layout that a learning agent sees."""
         row = foreign.numbers(self._task.reading(name, observation), f"what {name} sees")
-        if (width := row.size) != (expected := self._task.layout_of(name).width):
+        if (width := row.size) != (expected := self.kinds[name].observation.width):
             raise UserError(
                 f"{name} sees {width} numbers, but the layout has {expected}; where agents are unlike, begin "
                 "'learners' with the name of one kind, and let the others act by 'opponent', or give 'observation' and "
@@ -205,7 +199,7 @@ class Copy:
         rows = np.zeros((len(self.learners), self._width), np.float32)
         for row, name in zip(rows, self.learners, strict=True):
             if name in given:
-                row[: self._task.layout_of(name).width] = self.see(name, given[name])
+                row[: self.kinds[name].observation.width] = self.see(name, given[name])
         return rows
 
     def require_spaces(self) -> None:
@@ -216,8 +210,8 @@ class Copy:
         for name in self.learners:
             with self.naming("reading"):
                 self.see(name, first[name])
-            action = task.action_of(name)
-            if task.masks_of(name) and isinstance(action, Discrete):
+            action = self.kinds[name].action
+            if self.kinds[name].masks and isinstance(action, Discrete):
                 size = np.size(task.allowed(name, first[name], infos.get(name, {})))
                 if size != action.count:
                     raise UserError(f"{name} has a mask of {size} actions, but the task has {action.count}")
@@ -251,13 +245,13 @@ class Copy:
 
     def take(self) -> Array:
         by_task = type(self._task).take is not CopyHooks.take
-        row = self._task.take(self._task.own_of(self.env)) if by_task else self.simulator.read()
+        row = self._task.take(self._own) if by_task else self.simulator.read()
         return foreign.numbers(() if row is None else row, "what 'take' returns")
 
     def put(self, state: Array) -> Mapping[Any, Any] | None:
         """Put the simulator into a state at a start; return what agents see then, where the environment says so."""
         if type(self._task).put is not CopyHooks.put:
-            self._task.put(self._task.own_of(self.env), state)
+            self._task.put(self._own, state)
         else:
             self.simulator.write(state)
         return self.simulator.look(self.agents)

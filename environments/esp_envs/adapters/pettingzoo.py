@@ -6,7 +6,9 @@ The adapter needs `possible_agents`, `reset(seed)`, `step(actions)` and the spac
 from __future__ import annotations
 
 import multiprocessing
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -23,7 +25,7 @@ from esp_envs.adapters.stepper import CopyStepper
 from esp_envs.base import Environment, Observation, Step, require_shape
 from esp_envs.errors import UserError
 from esp_envs.installed import available_cores
-from esp_envs.roles import Role, of_role, spec_with_roles, with_state
+from esp_envs.roles import spec_with_roles, with_state
 from esp_envs.scene import Scene
 from esp_envs.settings import TaskSettings
 from esp_envs.spec import ActionSpace, Layout, TaskSpec
@@ -88,20 +90,8 @@ class ParallelTask(CopyHooks, Environment):
 
     def _described(self, one: Copy) -> TaskSpec:
         """Return the spec, with roles where agents of several kinds learn."""
-        roles = [
-            Role(
-                name=role,
-                num_agents=len(agents),
-                observation=self.layout_of(agents[0]),
-                action=self.action_of(agents[0]),
-                shared_reward=of_role(self.shared_reward, role, False),
-                masks=self.masks_of(agents[0]),
-            )
-            for role in self.role_names or ("",)
-            if (agents := [name for name in one.learners if self.role_of(name) == role])
-        ]
         return spec_with_roles(
-            roles,
+            [replace(kind, num_agents=count) for kind, count in Counter(one.kinds.values()).items()],
             name=type(self).__name__.lower(),
             version=1,
             convention=self.convention,

@@ -12,7 +12,6 @@ from esp_envs.adapters import foreign
 from esp_envs.adapters.copies import FINAL, NOW, TERMINATED, TRUNCATED, Board
 from esp_envs.adapters.hooks import Copy, CopyHooks
 from esp_envs.errors import UserError
-from esp_envs.roles import of_role
 from esp_envs.spec import Discrete
 
 
@@ -21,6 +20,7 @@ class CopyStepper:
 
     def __init__(self, task: CopyHooks, board: Board, copies: range, simulated: bool = False) -> None:
         self._task, self.board, self._simulated = task, board, simulated
+        self._of_task = f"of {type(task).__name__}"
         self._copies: dict[int, Copy] = {}
         self._copies.update((k, Copy(task)) for k in copies)
         self._seen: dict[int, Mapping[str, Any]] = {}
@@ -90,22 +90,21 @@ class CopyStepper:
                 self._lost -= self._told
         self._require_whole(copy, seen, acting, ended | cut, flags)
         if missing := [name for name in acting if name not in seen and (name in cut or name not in ended)]:
-            of_task = f"of {type(task).__name__}"
-            raise UserError(f"'step' gives {missing[0]} {of_task} no observation; give one to all that have not ended")
+            who = f"{missing[0]} {self._of_task}"
+            raise UserError(f"'step' gives {who} no observation; give one to all that have not ended")
         paid = {name: self._paid(name, reward, name in ended and name not in seen) for name in acting}
-        shared = self._shared(paid)
-        board.reward[k] = [paid.get(name, shared.get(task.role_of(name), 0.0)) for name in copy.learners]
+        shared = self._shared(copy, paid)
+        board.reward[k] = [paid.get(name, shared.get(kind.name, 0.0)) for name, kind in copy.kinds.items()]
         over = [name for name in acting if name in ended or name in cut]
         if over and len(over) < len(acting) and not task.agents_end:
-            raise UserError(
-                f"{over[0]} of {type(task).__name__} ends before the others; set 'agents_end = True' in the class"
-            )
+            who = f"{over[0]} {self._of_task}"
+            raise UserError(f"{who} ends before the others; set 'agents_end = True' in the class")
         # where agents end one by one, `alive` says who has ended, and a value lies beyond for one that is cut
         ends = all if task.agents_end else any
         board.ended[k] = self._how(k, len(over) == len(acting), ends(name in ended for name in acting))
         if not board.ended[k] and (alone := [name for name in over if name in cut]):
-            of_task = f"of {type(task).__name__}"
-            raise UserError(f"{alone[0]} {of_task} is truncated while others go on; let it terminate, or truncate all")
+            who = f"{alone[0]} {self._of_task}"
+            raise UserError(f"{who} is truncated while others go on; let it terminate, or truncate all")
         going = {name for name in copy.rest if name in seen} - ended - cut
         self._living[k] = going | {name for name in acting if name not in ended}
         self._write(k, FINAL)
@@ -117,15 +116,14 @@ class CopyStepper:
             for seen_by in (board.obs, board.state, board.mask, board.alive):
                 seen_by[NOW, k] = seen_by[FINAL, k]
 
-    def _shared(self, paid: Mapping[Any, float]) -> dict[str, float]:
+    def _shared(self, copy: Copy, paid: Mapping[Any, float]) -> dict[str, float]:
         """Return the rewards that agents share, by role, after checking that they are the same."""
-        task, shared = self._task, dict[str, float]()
-        for name, reward in paid.items():
-            role = task.role_of(name)
-            if not of_role(task.shared_reward, role, False):
+        shared = dict[str, float]()
+        for kind, reward in ((copy.kinds[name], reward) for name, reward in paid.items()):
+            if not kind.shared_reward:
                 continue
-            if not np.allclose(reward, shared.setdefault(role, reward), 1e-5, 1e-8, equal_nan=True):
-                raise UserError(f"agents of {type(task).__name__} get different rewards; leave out 'shared_reward'")
+            if not np.allclose(reward, shared.setdefault(kind.name, reward), 1e-5, 1e-8, equal_nan=True):
+                raise UserError(f"agents {self._of_task} get different rewards; leave out 'shared_reward'")
         return shared
 
     def _require_metrics(self, k: int) -> None:
@@ -134,7 +132,7 @@ class CopyStepper:
         if len(self._whole) == len(self._copies):
             told = ", ".join(sorted(map(str, self._told))[:8]) or "nothing"
             raise UserError(
-                f"no info of {type(self._task).__name__} holds the metric '{min(self._lost)}' in a whole episode; they "
+                f"no info {self._of_task} holds the metric '{min(self._lost)}' in a whole episode; they "
                 f"hold {told}; correct 'metrics', or define 'measure'"
             )
 
@@ -142,18 +140,18 @@ class CopyStepper:
         self, copy: Copy, seen: Mapping[Any, Any], acting: Sequence[Any], over: set[Any], flags: Sequence[Any]
     ) -> None:
         """Refuse learning agents that come back, and those of which nothing says whether they have ended."""
-        of_task = f"of {type(self._task).__name__}"
         for name in copy.learners:
             if name in over:
                 continue
+            who = f"{name} {self._of_task}"
             if name not in acting and name in seen:
-                raise UserError(f"{name} {of_task} is back after its end; end agents for good, or keep their flags set")
-            if name in acting and not any(who in flag for who in (name, foreign.EVERYONE) for flag in flags):
-                raise UserError(f"'step' does not say whether {name} {of_task} has ended; give it both flags")
+                raise UserError(f"{who} is back after its end; end agents for good, or keep their flags set")
+            if name in acting and not any(one in flag for one in (name, foreign.EVERYONE) for flag in flags):
+                raise UserError(f"'step' does not say whether {who} has ended; give it both flags")
 
     def _paid(self, name: Any, reward: Mapping[Any, Any], left: bool) -> float:
         if name not in reward and not left:
-            raise UserError(f"'step' gives {name} of {type(self._task).__name__} no reward; give one to all that acted")
+            raise UserError(f"'step' gives {name} {self._of_task} no reward; give one to all that acted")
         return float(foreign.numbers(reward[name], f"the reward of {name}", 1)[0]) if name in reward else 0.0
 
     def _how(self, k: int, over: bool, terminated: bool) -> int:
@@ -164,7 +162,7 @@ class CopyStepper:
         if over and not self.board.cut[k] and not task.terminates:
             way = "set 'terminates = True' in the class"
             way = way if terminated else f"give both the same number of steps, or {way}"
-            raise UserError(f"an episode of {type(task).__name__} ends before its horizon; {way}")
+            raise UserError(f"an episode {self._of_task} ends before its horizon; {way}")
         return TRUNCATED if over or self.board.cut[k] else 0
 
     def _write(self, k: int, when: int) -> None:
@@ -176,10 +174,9 @@ class CopyStepper:
         if task.masks:
             over = when == FINAL and board.ended[k] > 0
             with copy.naming("allowed", k):
-                for i, name in enumerate(copy.learners):
-                    row = np.ones(board.mask.shape[-1], np.float32)
-                    action = task.action_of(name)
-                    if alive[i] and task.masks_of(name) and isinstance(action, Discrete):
+                for i, (name, kind) in enumerate(copy.kinds.items()):
+                    row, action = np.ones(board.mask.shape[-1], np.float32), kind.action
+                    if alive[i] and kind.masks and isinstance(action, Discrete):
                         allowed = task.allowed(name, seen[name], infos.get(name, {}))
                         row[: action.count] = foreign.numbers(allowed, f"the mask of {name}", action.count)
                         row[action.count :] = 0
@@ -189,7 +186,7 @@ class CopyStepper:
         if self._simulated:
             state = copy.take()
         else:
-            rows = zip(board.obs[when, k], copy.learners, strict=True)
-            own = [row[: task.layout_of(name).width] for row, name in rows]
+            rows = zip(board.obs[when, k], copy.kinds.values(), strict=True)
+            own = [row[: kind.observation.width] for row, kind in rows]
             state = np.concatenate(own) if task.state is None else copy.state(k)
         board.state[when, k] = foreign.numbers(state, "the state", board.state.shape[-1])

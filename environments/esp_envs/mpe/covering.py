@@ -110,33 +110,23 @@ def shared_out(position: Tensor, landmark: Tensor) -> Tensor:
     N^L ways are tried, for which `MAX_SHARINGS` is a good limit.
     """
     agents, landmarks = position.shape[0], landmark.shape[0]
-    places, costs = _places(position, landmark)
+
+    @cache
+    def spot(agent: int, *share: int) -> tuple[Tensor, Tensor]:
+        """Return where an agent stands best for its share of landmarks [2, W], and what that costs [W]."""
+        here, own = position[agent], landmark[list(share)]
+        place = _best_spot(here, own) if share else here
+        return place, (own - place).norm(dim=1).sum(0) + TRAVEL_WEIGHT * (place - here).norm(dim=0)
+
     best = torch.full_like(position[0, 0], torch.inf)
     goal = position.clone()
     for owners in itertools.product(range(agents), repeat=landmarks):
-        shares = [sum(1 << k for k in range(landmarks) if owners[k] == i) for i in range(agents)]
-        cost = torch.stack([costs[i][share] for i, share in enumerate(shares)]).sum(0)
+        spots = [spot(i, *(k for k in range(landmarks) if owners[k] == i)) for i in range(agents)]
+        cost = torch.stack([cost for _, cost in spots]).sum(0)
         better = cost < best
         best = torch.where(better, cost, best)
-        goal = torch.where(better, torch.stack([places[i][share] for i, share in enumerate(shares)]), goal)
+        goal = torch.where(better, torch.stack([place for place, _ in spots]), goal)
     return goal
-
-
-def _places(position: Tensor, landmark: Tensor) -> tuple[list[list[Tensor]], list[list[Tensor]]]:
-    """Return, for each agent and each set of landmarks (a bit mask), where to stand [2, W] and its cost [W]."""
-    landmarks = landmark.shape[0]
-    places, costs = [], []
-    for here in position:
-        own_places, own_costs = [here], [torch.zeros_like(here[0])]
-        for mask in range(1, 1 << landmarks):
-            share = landmark[[k for k in range(landmarks) if mask >> k & 1]]
-            spot = _best_spot(here, share)
-            remaining = (share - spot).norm(dim=1).sum(0)
-            own_places.append(spot)
-            own_costs.append(remaining + TRAVEL_WEIGHT * (spot - here).norm(dim=0))
-        places.append(own_places)
-        costs.append(own_costs)
-    return places, costs
 
 
 def _best_spot(here: Tensor, share: Tensor) -> Tensor:

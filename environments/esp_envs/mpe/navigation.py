@@ -16,7 +16,7 @@ from esp_envs.batched import World
 from esp_envs.mpe import covering
 from esp_envs.mpe.many import ManyWorlds
 from esp_envs.mpe.particles import Bodies
-from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings, ParticleTask
+from esp_envs.mpe.task import FORCE, MOVES, OWN, ParticleSettings, ParticleTask
 from esp_envs.scene import DARK, Body, Scene, look
 from esp_envs.spec import Field, Items, Kind, TaskSpec, filled_layout, layout
 
@@ -144,11 +144,7 @@ class Navigation(ParticleTask):
             convention=f"{settings.convention}: {reward}{settings.broken_in_words()}",
             num_agents=agents,
             horizon=settings.horizon,
-            observation=filled_layout(
-                Field("velocity", Kind.VECTOR, 1, "length/s"),
-                Field("position", Kind.VECTOR, 1, "length", is_point=True),
-                *settings.seen_fields("landmarks", landmarks, "others"),
-            ),
+            observation=filled_layout(*OWN, *settings.seen_fields("landmarks", landmarks, "others")),
             state=layout(
                 Field("velocity", Kind.VECTOR, agents, "length/s", Items.AGENTS),
                 Field("position", Kind.VECTOR, agents, "length", Items.AGENTS, is_point=True),

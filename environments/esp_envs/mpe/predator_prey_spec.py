@@ -9,7 +9,7 @@ from pydantic import model_validator
 
 from esp_envs.errors import UserError
 from esp_envs.mpe.many import MOST_BODIES
-from esp_envs.mpe.task import FORCE, MOVES, ParticleSettings
+from esp_envs.mpe.task import FORCE, MOVES, OWN, ParticleSettings
 from esp_envs.roles import Role, spec_with_roles
 from esp_envs.spec import Field, Items, Kind, Layout, TaskSpec, filled_layout
 
@@ -80,8 +80,7 @@ def predator_prey_spec(settings: PredatorPreySettings) -> TaskSpec:
 
 def _predator_layout(settings: PredatorPreySettings) -> Layout:
     return filled_layout(
-        Field("velocity", Kind.VECTOR, 1, "length/s"),
-        Field("position", Kind.VECTOR, 1, "length", is_point=True),
+        *OWN,
         *settings.seen_fields("obstacles", settings.num_obstacles, "predators"),
         Field("prey", Kind.VECTOR, 1, "length", family="prey"),
         Field("prey_velocity", Kind.VECTOR, 1, "length/s", family="prey"),
@@ -91,8 +90,7 @@ def _predator_layout(settings: PredatorPreySettings) -> Layout:
 def prey_layout(settings: PredatorPreySettings) -> Layout:
     """Return what a prey observes."""
     return filled_layout(
-        Field("velocity", Kind.VECTOR, 1, "length/s"),
-        Field("position", Kind.VECTOR, 1, "length", is_point=True),
+        *OWN,
         Field("obstacles", Kind.VECTOR, settings.num_obstacles, "length", family="obstacles"),
         Field("predators", Kind.VECTOR, settings.num_predators, "length", family="predators"),
     )

@@ -26,6 +26,8 @@ MOVES = Discrete(Kind.VECTOR, (STILL, LEFT, RIGHT, DOWN, UP), ("no-op", "left", 
 """The five discrete actions in MPE's order; the meaning of each is the direction of its force."""
 FORCE = Continuous(layout(Field("force", Kind.VECTOR, 1, "share of the full force")))
 """The continuous action: one force in the unit disc."""
+OWN = (Field("velocity", Kind.VECTOR, 1, "length/s"), Field("position", Kind.VECTOR, 1, "length", is_point=True))
+"""With what every observation begins."""
 
 
 class ParticleSettings(TaskSettings):
