@@ -80,8 +80,10 @@ def exported_program(program: Program) -> torch.export.ExportedProgram:
 
 def torch_archive(program: Program, description: str) -> bytes:
     """Write a program as an archive of torch.export."""
-    content = BytesIO()
-    torch.export.save(exported_program(program), content, extra_files={"policy.json": description})
+    content, exported = BytesIO(), exported_program(program)
+    for node in exported.graph.nodes:
+        node.meta.pop("stack_trace", None)  # which names the folders of this machine
+    torch.export.save(exported, content, extra_files={"policy.json": description})
     return content.getvalue()
 
 
