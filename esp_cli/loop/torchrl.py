@@ -127,7 +127,7 @@ class SymmetricLoss(nn.Module):
 
     def _ask(self, data: TensorDictBase, size: int) -> tuple[TensorDictBase, list[Policy], list[Tensor]]:
         """Return the losses of data, and for each `size` rows of it the policies (none of QMIX) and the values."""
-        said: TensorDictBase | None = None
+        policies: list[Policy] = []
         value: Tensor | None = None
         critic = self.loss.mixer_network if self.mixes else self.loss.critic_network
         key = self.loss.tensor_keys.global_value if self.mixes else self.loss.tensor_keys.value
@@ -137,23 +137,18 @@ class SymmetricLoss(nn.Module):
             if value is None or output.get(key).requires_grad:  # not what targets are made of
                 value = output.get(key)
 
-        hook = critic.register_forward_hook(hear_value)
-        actor: Any = None if self.mixes else self.loss.actor_network
+        def hear_policy(_: nn.Module, __: Any, output: TensorDictBase) -> None:
+            policies[:] = map(actor.build_dist_from_params, output.split(size))
 
-        def hear_policy(tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> TensorDictBase:
-            nonlocal said
-            said = type(actor).get_dist_params(actor, tensordict, *args, **kwargs)
-            return said
-
+        actor: Any = getattr(self.loss, "actor_network", None)
+        hooks = [critic.register_forward_hook(hear_value)]
         if actor is not None:
-            actor.get_dist_params = hear_policy
+            hooks.append(actor.det_part.register_forward_hook(hear_policy))
         try:
             losses = self.loss(data)
         finally:
-            hook.remove()
-            if actor is not None:
-                del actor.get_dist_params
+            for hook in hooks:
+                hook.remove()
         if value is None:
             raise UserError(f"{type(self.loss).__name__} did not ask its critic; give it one")
-        policies = [] if said is None else [actor.build_dist_from_params(part) for part in said.split(size)]
         return losses, policies, list(value.split(size))
