@@ -143,11 +143,10 @@ def draw_curves(curves: Mapping[str, Sequence[tuple[float, float]]], steps: int,
         if points:
             at, means = np.array(points).T
             shown = np.arange(columns) * steps / (columns - 1)
-            shown = shown[(shown >= at[0]) & (shown <= max(at[-1], steps / columns))]
-            share = (np.interp(shown, at, means) - low) / max(high - low, 1e-9)
+            share = (np.interp(shown, at, means, np.nan, np.nan) - low) / max(high - low, 1e-9)
             seen = np.isfinite(share)  # where a seed stopped there is no mean
             rows = np.round((1 - share[seen]) * (_HEIGHT - 1)).astype(int)
-            grid[rows, np.round(shown[seen] / steps * (columns - 1)).astype(int)] = index
+            grid[rows, np.flatnonzero(seen)] = index
     text = Text()
     for number, row in enumerate(grid):
         level = {0: high, _HEIGHT - 1: low}.get(number) if values else None
