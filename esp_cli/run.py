@@ -173,23 +173,9 @@ class Run(Shown):
         return TrainedPolicy.read(self.path).transfer(settings or {})
 
 
-def plan(
-    task: str,
-    algo: str,
-    *,
-    steps: int,
-    seeds: Sequence[int],
-    preset: str,
-    settings: Mapping[str, object] | None,
-    device: str,
-    init_from: str | os.PathLike[str] | None,
-) -> tuple[RunConfig, dict[str, Tensor] | None]:
-    """Return the configuration of a new run and its first weights, as `train`; refuse what does not go together."""
-    if isinstance(seeds, int):
-        raise UserError(f"seeds are the numbers of the seeds, not how many; write seeds=range({seeds})")
-    if not isinstance(steps, Integral):
-        raise UserError(f"steps are a whole number, not {steps!r}; write for example steps=100_000")
-    config = prepared(resolve_config(task, algo, preset, steps, seeds, resolve_device(device), settings))
+def plan(config: RunConfig, init_from: str | os.PathLike[str] | None) -> tuple[RunConfig, Mapping[str, Tensor] | None]:
+    """Return the configuration of a new run with what has to be measured, and its first weights, as `train` says."""
+    config = prepared(config)
     learner = build_learner(config)
     if init_from is None:
         return config, None
@@ -249,9 +235,12 @@ def train(
     named = (settings or {}).get("network.name")
     register_own(None, None, named if isinstance(named, str) else None)
     name, algorithm = register(task), ALGORITHMS.register(algo)
-    config, weights = plan(
-        name, algorithm, steps=steps, seeds=seeds, preset=preset, settings=settings, device=device, init_from=init_from
-    )
+    if isinstance(seeds, int):
+        raise UserError(f"seeds are the numbers of the seeds, not how many; write seeds=range({seeds})")
+    if not isinstance(steps, Integral):
+        raise UserError(f"steps are a whole number, not {steps!r}; write for example steps=100_000")
+    asked = resolve_config(name, algorithm, preset, steps, seeds, resolve_device(device), settings)
+    config, weights = plan(asked, init_from)
     require(track)
     run = begin(config, weights, out)
     run.train(listener, track, check)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -16,7 +17,6 @@ from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
     from esp_cli.checking import ElementVerdict, PolicyVerdict, SymmetryReport
-    from esp_envs import Environment
     from esp_envs.conformance import Finding
     from esp_envs.promises import MakeWorlds
     from esp_envs.spec import TaskSpec
@@ -87,10 +87,7 @@ def check(
         raise UserError(f"{names} belong to 'esp check symmetry'; leave them out")
     options.register_named([task], algo, network)
     chosen = resolve_task_settings(task, options.parse_task_settings(settings or []))
-
-    def make_worlds(num_envs: int, seeds: Sequence[int]) -> Environment:
-        return make(task, num_envs, seeds, chosen)
-
+    make_worlds = partial(make, task, settings=chosen)
     spec = make_worlds(1, [0]).spec  # a mistake in task or settings is the user's, not a broken promise
     if what == "task":
         code = _check_task(task, spec, make_worlds, seconds, json)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,6 +15,7 @@ from typer import Option
 
 from esp_cli import console
 from esp_cli.commands import options
+from esp_cli.commands.study_options import StudyChoices
 from esp_cli.commands.study_progress import StudyProgress
 from esp_cli.files.formatting import format_count
 
@@ -45,36 +47,27 @@ def demo(
     Called again, it goes on where it was.
     """
     from esp_cli.commands import studying
-    from esp_cli.console.progress import stop_requests
     from esp_cli.studies.catalogue import refuse_untrainable
-    from esp_cli.studies.engine import LocalEngine
     from esp_cli.studies.study import StudyFolder
 
-    study = _plan(task, steps, seeds or SEEDS, options.command_line(context), settings or [])
+    choices = StudyChoices(seeds=seeds or SEEDS, jobs=2, settings=settings, episodes=_EPISODES)
+    choices.command = options.command_line(context)
+    study = _plan(task, steps, choices)
     refuse_untrainable(study)
-    with StudyFolder.held(out), stop_requests("stopping both runs after their iteration") as requests:
+    with studying.working(choices, out, "cpu", "both runs after their iteration") as resources:
         folder = StudyFolder.create(out, study)
         folder.study = study.model_copy(update={"cells": tuple(folder.cells_of(study))})  # of this call alone
-        resources = studying.Resources(LocalEngine(), 2, (), check=True)
-        failed = studying.run_cells(folder, study, resources, requests, LiveCurves(folder))
-    if requests:
-        raise studying.stopped(study.command)
+        failed = studying.run_cells(folder, study, resources, LiveCurves(folder))
     studying.refuse_failed(failed, out)
     _show(folder)
 
 
-def _plan(task: str, steps: int, seeds: tuple[int, ...], command: str, settings: list[str]) -> Study:
-    from esp_cli.studies.catalogue import Request, plan
+def _plan(task: str, steps: int, choices: StudyChoices) -> Study:
+    from esp_cli.studies.catalogue import plan
 
     options.register_named([task])
-    request = Request(
-        tasks=(task,),
-        steps=((None, steps),),
-        seeds=seeds,
-        overrides={"evaluation.every_steps": max(1, steps // _EVALUATIONS)} | options.parse_assignments(settings),
-        episodes=_EPISODES,
-        command=command,
-    )
+    request, often = choices.request(), {"evaluation.every_steps": max(1, steps // _EVALUATIONS)}
+    request = replace(request, tasks=(task,), steps=((None, steps),), overrides={**often, **request.overrides})
     study = plan("ablate-prior", request)
     cells = tuple(cell.model_copy(update={"variant": LABELS[cell.config.prior.kind]}) for cell in study.cells)
     return study.model_copy(update={"title": "One learner with symmetry and without it", "cells": cells})
@@ -149,11 +142,10 @@ def draw_curves(curves: Mapping[str, Sequence[tuple[float, float]]], steps: int,
         if points:
             at, means = np.array(points).T
             shown = np.arange(columns) * steps / (columns - 1)
-            shown = shown[(shown >= at[0]) & (shown <= max(at[-1], steps / columns))]
-            share = (np.interp(shown, at, means) - low) / max(high - low, 1e-9)
+            share = (np.interp(shown, at, means, np.nan, np.nan) - low) / max(high - low, 1e-9)
             seen = np.isfinite(share)  # where a seed stopped there is no mean
             rows = np.round((1 - share[seen]) * (_HEIGHT - 1)).astype(int)
-            grid[rows, np.round(shown[seen] / steps * (columns - 1)).astype(int)] = index
+            grid[rows, np.flatnonzero(seen)] = index
     text = Text()
     for number, row in enumerate(grid):
         level = {0: high, _HEIGHT - 1: low}.get(number) if values else None

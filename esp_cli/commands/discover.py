@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,7 +15,6 @@ from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
     from esp_cli.checking import SymmetryReport
-    from esp_envs import Environment
 
 EPILOG = """Examples:\n
     esp discover navigation --set task.wind=0.3\n
@@ -83,11 +82,7 @@ def _discovery(
         name, settings = config.task, config.task_settings | settings
         if task not in (None, name):
             raise UserError(f"{what} is a run of {name}, and --task says {task}; leave --task out")
-    settings = resolve_task_settings(name, settings)
-
-    def worlds(num_envs: int, seeds: Sequence[int]) -> Environment:
-        return make(name, num_envs, seeds, settings)
-
+    worlds = partial(make, name, settings=resolve_task_settings(name, settings))
     with console.watching("check", "elements") as watch:
         return check_symmetry(worlds, transforms, logs, watch, seconds)
 

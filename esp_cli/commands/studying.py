@@ -6,7 +6,7 @@ import shlex
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,6 +38,7 @@ class Resources:
     jobs: int  # at once
     reused: Sequence[StudyFolder]  # studies whose finished runs are taken over
     check: bool  # whether runs take a short look at a task that is not built in
+    requests: Sequence[int] = ()  # to stop; not empty once the user asks for it
 
 
 @contextmanager
@@ -63,9 +64,27 @@ def open_resources(choices: StudyChoices, out: Path, device: str) -> Iterator[Re
         yield Resources(engine, choices.jobs or engine.places(device), reused, check)
 
 
+@contextmanager
+def working(
+    choices: StudyChoices, out: Path, device: str, stopping: str = "every run after its iteration"
+) -> Iterator[Resources]:
+    """Hold the folder `out`, and yield what a study in it is run with; where the user stops it, the command ends."""
+    from esp_cli.studies.study import StudyFolder
+
+    with (
+        open_resources(choices, out, device) as resources,
+        StudyFolder.held(out),
+        stop_requests(f"stopping {stopping}") as requests,
+    ):
+        yield replace(resources, requests=requests)
+    if requests:
+        console.note(f"stopped; go on with: {choices.command}")
+        raise typer.Exit(130)
+
+
 def run_or_forecast(kind: str, request: Request, choices: StudyChoices) -> None:
     """Run and report a study of a kind of `studies.kinds`, or say what it costs, where only that was asked for."""
-    from esp_cli.studies.catalogue import plan, without_effect
+    from esp_cli.studies.catalogue import plan, refuse_untrainable, without_effect
     from esp_cli.studies.study import StudyFolder
 
     out, study = choices.folder(kind), plan(kind, request)
@@ -73,26 +92,14 @@ def run_or_forecast(kind: str, request: Request, choices: StudyChoices) -> None:
     if choices.dry_run:
         StudyFolder.planned(out, study)  # refuses the folders that the run would refuse
         forecast(StudyFolder(out, study), choices)
-    else:
-        _run(out, study, choices)
-
-
-def _run(out: Path, study: Study, choices: StudyChoices) -> None:
-    from esp_cli.studies.catalogue import refuse_untrainable
-    from esp_cli.studies.study import StudyFolder
-
+        return
     refuse_untrainable(study)
-    with (
-        open_resources(choices, out, study.cells[0].config.device) as resources,
-        StudyFolder.held(out),
-        stop_requests("stopping every run after its iteration") as requests,
-    ):
+    with working(choices, out, study.cells[0].config.device) as resources:
         begun = time.monotonic()
         folder = StudyFolder.create(out, study)
-        failed = run_cells(folder, study, resources, requests)
-    if not requests:
-        console.note(f"this took {console.format_duration(time.monotonic() - begun)}")
-    conclude(folder, failed, requests, out, choices)
+        failed = run_cells(folder, study, resources)
+    console.note(f"this took {console.format_duration(time.monotonic() - begun)}")
+    conclude(folder, failed, out, choices)
 
 
 def search_or_forecast(search: Search, kind: str, choices: StudyChoices) -> None:
@@ -109,26 +116,18 @@ def search_or_forecast(search: Search, kind: str, choices: StudyChoices) -> None
         what = f"{len(search.draws)} trials of each, and the runs that judge"
         forecast(StudyFolder(out / FRESH, study), choices, trials, groups, what)
         return
-    with (
-        open_resources(choices, out, search.request.device) as resources,
-        Trials.held(out),
-        stop_requests("stopping every run after its iteration") as requests,
-    ):
+    with working(choices, out, search.request.device) as resources:
         trials = Trials.create(out, planned)
-        failed = follow(trials, trials.cells_of(planned), resources, requests)
-        if not (requests or failed):
+        failed = follow(trials, trials.cells_of(planned), resources)
+        if not (resources.requests or failed):
             study = search.judged(trials)
             fresh = StudyFolder.create(out / FRESH, study, search.keeps)
-            failed = run_cells(fresh, study, resources, requests)
-    conclude(fresh, failed, requests, out, choices)
+            failed = run_cells(fresh, study, resources)
+    conclude(fresh, failed, out, choices)
 
 
-def conclude(
-    study: StudyFolder | None, failed: Sequence[str], requests: Sequence[int], out: Path, choices: StudyChoices
-) -> None:
-    """End a command that ran a study in `out`: as stopped, or with the study's report and a word on what failed."""
-    if requests:
-        raise stopped(choices.command)
+def conclude(study: StudyFolder | None, failed: Sequence[str], out: Path, choices: StudyChoices) -> None:
+    """End a command that ran a study in `out`, with the study's report and a word on what failed."""
     if study is not None:
         from esp_cli.commands.report import print_answer
         from esp_cli.reporting.collect import collect_study
@@ -177,15 +176,11 @@ def forecast(
 
 
 def run_cells(
-    folder: StudyFolder,
-    study: Study,
-    resources: Resources,
-    requests: Sequence[int],
-    progress: StudyProgress | None = None,
+    folder: StudyFolder, study: Study, resources: Resources, progress: StudyProgress | None = None
 ) -> list[str]:
     """Run the cells of a study in its folder, which the caller's lock holds; return the names of those that failed.
 
-    Of cells that train the same, one is run. `requests` is not empty once the user asks to stop.
+    Of cells that train the same, one is run.
     """
     cells = folder.cells_of(study)
     taken = folder.adopt_finished(cells, resources.reused)
@@ -193,18 +188,14 @@ def run_cells(
         console.note(f"taking over {twin} as {cell.name}")
     if resources.reused and not taken and not all(folder.run_path(cell).exists() for cell in cells):
         console.note("--reuse gives nothing: no run there is finished with the configuration and episodes of one here")
-    failed = follow(folder, folder.unlike(cells), resources, requests, progress)
+    failed = follow(folder, folder.unlike(cells), resources, progress)
     for cell, twin in folder.adopt_finished(cells, [folder]):
         console.note(f"taking over {twin} as {cell.name}, which trains the same")
     return failed
 
 
 def follow(
-    folder: StudyFolder,
-    cells: Sequence[Cell],
-    resources: Resources,
-    requests: Sequence[int],
-    progress: StudyProgress | None = None,
+    folder: StudyFolder, cells: Sequence[Cell], resources: Resources, progress: StudyProgress | None = None
 ) -> list[str]:
     """Run cells of a study with live progress, by default a bar for each; return the names of the failed."""
     from esp_cli.studies.scheduler import Scheduler
@@ -219,16 +210,10 @@ def follow(
 
         def listen(scheduler: Scheduler) -> bool:
             shown.update(scheduler)
-            return not requests
+            return not resources.requests
 
         scheduler.run(listen)
     return [run.cell.name for run in scheduler.runs if run.status == "failed"]
-
-
-def stopped(command: str) -> typer.Exit:
-    """Say how to go on with what the user stopped; return what ends the command."""
-    console.note(f"stopped; go on with: {command}")
-    return typer.Exit(130)
 
 
 def refuse_failed(names: Sequence[str], out: Path) -> None:

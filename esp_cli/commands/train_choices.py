@@ -36,12 +36,12 @@ def plan_run(
         choices, settings, chosen = _with_file(context, told, choices, settings)
     start = choices.pop("init_from")
     choices["device"] = resolve_device(choices["device"])
-    idle = chosen & resolve_config(**choices, overrides=settings).without_effect()
-    config, weights = plan(algo=choices.pop("algorithm"), settings=settings, init_from=start, **choices)
+    asked = resolve_config(**choices, overrides=settings)
+    config, weights = plan(asked, start)
     repeated = None if told is None or was_given(context, "init_from") else told.config
     if repeated and repeated.seeds == config.seeds and repeated.init_from != config.init_from:
         raise UserError(f"{start} holds other weights than the run of {file} started from; add --init-from POLICY")
-    return config, weights, idle
+    return config, weights, chosen & asked.without_effect()
 
 
 def _with_file(

@@ -67,7 +67,7 @@ class TrainingProgress:
         self.description = description
         self.unit = unit
         self._clock = clock
-        self._start = self._done = start
+        self._done = start
         self._metrics: dict[str, float] = {}
         self._history: deque[tuple[float, int]] = deque()
         self._last_line_s = -math.inf
@@ -75,11 +75,10 @@ class TrainingProgress:
         self._live: Progress | None = None
 
     def __enter__(self) -> TrainingProgress:
-        self._begin_s = self._clock()
-        self._history.append((self._begin_s, self._start))
+        self._history.append((self._clock(), self._done))
         self._live = live_progress()
         if self._live is not None:
-            self._task = self._live.add_task("", total=self.total, completed=self._start, status=self.description)
+            self._task = self._live.add_task("", total=self.total, completed=self._done, status=self.description)
             self._live.start()
         return self
 

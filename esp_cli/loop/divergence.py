@@ -55,24 +55,6 @@ def policy_divergence(transform: Transform, there: Policy, here: Policy, samples
     raise UserError(f"the policy's {type(there).__name__} is not known for {action} actions; give {_KNOWN}")
 
 
-def split_policy(policy: Policy, size: int) -> list[Policy]:
-    """Cut what a policy says of rows [B, ...] into pieces of `size` rows; arguments as of `policy_divergence`."""
-    if isinstance(policy, Tensor):
-        return list(policy.split(size))
-    if isinstance(policy, td.Independent):
-        inner, count = split_policy(policy.base_dist, size), policy.reinterpreted_batch_ndims
-        return [td.Independent(part, count, validate_args=False) for part in inner]
-    if isinstance(policy, td.Categorical | td.OneHotCategorical):
-        return [td.Categorical(logits=part, validate_args=False) for part in policy.logits.split(size)]
-    if isinstance(policy, td.Normal):
-        pairs = zip(policy.loc.split(size), policy.scale.split(size), strict=True)
-        return [td.Normal(mean, scale, validate_args=False) for mean, scale in pairs]
-    if _is_squashed(policy):
-        inner = split_policy(policy.base_dist, size)
-        return [td.TransformedDistribution(part, policy.transforms, validate_args=False) for part in inner]
-    raise UserError(f"the policy's {type(policy).__name__} is not known; give {_KNOWN}")
-
-
 def _bare(policy: Policy) -> Policy:
     """Return a distribution without `Independent` around it."""
     if isinstance(policy, tuple | list):

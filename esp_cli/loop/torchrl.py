@@ -7,7 +7,7 @@ loss = SymmetricLoss(MAPPOLoss(actor, critic), symmetry, coefficient=0.1)
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torchrl.envs.transforms import Transform as TorchRLTransform
 from torchrl.objectives import LossModule
 
-from esp_cli.loop.divergence import Policy, policy_divergence, split_policy
+from esp_cli.loop.divergence import Policy, policy_divergence
 from esp_cli.loop.shapes import carry
 from esp_cli.loop.symmetry import Symmetry
 from esp_cli.loop.tensordicts import Role, with_copies
@@ -42,14 +42,6 @@ class SymmetricCopies(TorchRLTransform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the data with its copies; see `Symmetry.augment_tensordict`."""
         return self.symmetry.augment_tensordict(tensordict, self.roles)
-
-
-class _Answers(NamedTuple):
-    """Losses, the policy's distribution (None of action values) and values [B, ...]."""
-
-    losses: TensorDictBase
-    policy: Policy
-    value: Tensor
 
 
 _TERMS = {"policy": "loss_objective", "value": "loss_critic"}  # which loss of PPO each term is added to
@@ -97,15 +89,16 @@ class SymmetricLoss(nn.Module):
             self.symmetry.spaces, self._needed(tensordict), self.symmetry.transforms, self.roles
         )
         batches: list[Any] = [torch.cat(parts, 0)] if self.augment else parts
-        answers = [self._ask(batch) for batch in batches]
-        losses, size = answers[0].losses, len(tensordict)
+        size = len(tensordict)
+        answers = [self._ask(batch, size) for batch in batches]
+        losses = answers[0][0]
         if (priority := getattr(self.loss.tensor_keys, "priority", "td_error")) in batches[0].keys(True):
             tensordict.set(priority, batches[0].get(priority)[:size])
         gaps = {}
         if not self.mixes:
-            here, *there = (part for answer in answers for part in split_policy(answer.policy, size))
+            here, *there = (policy for _, policies, _ in answers for policy in policies)
             gaps["policy"] = [policy_divergence(g, p, here) for g, p in zip(transforms, there, strict=True)]
-        own, *moved = (part for answer in answers for part in answer.value.split(size))
+        own, *moved = (value for _, _, values in answers for value in values)
         gaps["value"] = [
             value_consistency_loss(carry(self.symmetry.spaces, g.values, v, tensordict.batch_size, "the value"), own)
             for g, v in zip(transforms, moved, strict=True)
@@ -132,9 +125,9 @@ class SymmetricLoss(nn.Module):
         read += [keys.action, keys.sample_log_prob, keys.advantage, keys.value_target, keys.value]
         return data.select(*read, strict=False)
 
-    def _ask(self, data: TensorDictBase) -> _Answers:
-        """Return the losses of data, and what the networks said of it on the way."""
-        policy: Policy = None
+    def _ask(self, data: TensorDictBase, size: int) -> tuple[TensorDictBase, list[Policy], list[Tensor]]:
+        """Return the losses of data, and for each `size` rows of it the policies (none of QMIX) and the values."""
+        policies: list[Policy] = []
         value: Tensor | None = None
         critic = self.loss.mixer_network if self.mixes else self.loss.critic_network
         key = self.loss.tensor_keys.global_value if self.mixes else self.loss.tensor_keys.value
@@ -144,22 +137,18 @@ class SymmetricLoss(nn.Module):
             if value is None or output.get(key).requires_grad:  # not what targets are made of
                 value = output.get(key)
 
-        hook = critic.register_forward_hook(hear_value)
-        actor: Any = None if self.mixes else self.loss.actor_network
+        def hear_policy(_: nn.Module, __: Any, output: TensorDictBase) -> None:
+            policies[:] = map(actor.build_dist_from_params, output.split(size))
 
-        def hear_policy(tensordict: TensorDictBase, *args: Any, **kwargs: Any) -> Policy:
-            nonlocal policy
-            policy = type(actor).get_dist(actor, tensordict, *args, **kwargs)
-            return policy
-
+        actor: Any = getattr(self.loss, "actor_network", None)
+        hooks = [critic.register_forward_hook(hear_value)]
         if actor is not None:
-            actor.get_dist = hear_policy
+            hooks.append(actor.det_part.register_forward_hook(hear_policy))
         try:
             losses = self.loss(data)
         finally:
-            hook.remove()
-            if actor is not None:
-                del actor.get_dist
+            for hook in hooks:
+                hook.remove()
         if value is None:
             raise UserError(f"{type(self.loss).__name__} did not ask its critic; give it one")
-        return _Answers(losses, policy, value)
+        return losses, policies, list(value.split(size))

@@ -185,7 +185,7 @@ class RefusingEngine:
 def test_a_study_hands_on_whether_its_runs_look_at_the_task(tmp_path: Path, no_check: bool) -> None:
     engine, study = RefusingEngine(), small_study()
     with open_resources(StudyChoices(no_check=no_check), tmp_path, "cpu") as resources:
-        run_cells(StudyFolder.create(tmp_path / "s", study), study, replace(resources, engine=engine), [])
+        run_cells(StudyFolder.create(tmp_path / "s", study), study, replace(resources, engine=engine))
     assert engine.asked
     assert all(("--no-check" in words) == no_check for words in engine.asked if words[0] == "train")
 
