@@ -70,7 +70,8 @@ def test_an_archive_and_the_python_file_take_one_world_and_no_world(tmp_path: Pa
     program = Program(
         17, (*seen, aggregate(begin=1, team=3, width=1, reach_squared=4.0)), 4, 0, 0, "choose", (), team=3
     )
-    (tmp_path / "policy.pt2").write_bytes(torch_archive(program, "{}"))
+    (tmp_path / "policy.pt2").write_bytes(content := torch_archive(program, "{}"))
+    assert b"torch_file.py" not in content, "files and folders of the machine that wrote it"
     archive, written = torch_runner(tmp_path / "policy.pt2"), numpy_policy(program)
     for worlds in (1, 4):
         rows = np.random.default_rng(worlds).standard_normal((3 * worlds, 17)).astype(np.float32)
