@@ -22,7 +22,8 @@ from esp_cli.networks.contract import WithVJP
 from esp_cli.networks.heads import Categorical
 from esp_cli.networks.plain import MlpConfig
 from esp_cli.networks.policy import StochasticPolicy
-from esp_cli.prior import Loss, PriorConfig, SeedBatch, SymmetryPrior, copies, mean_per_seed
+from esp_cli.prior import Loss, SeedBatch, SymmetryPrior, copies, mean_per_seed
+from esp_cli.prior.config import PriorConfig
 from esp_cli.prior.losses import value_consistency_loss
 from esp_cli.symmetry import transform_set
 from esp_envs import Field, Kind, Spaces, layout

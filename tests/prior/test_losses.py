@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from esp_cli.prior import PriorConfig, SymmetryPrior, policy_consistency_loss
+from esp_cli.prior import SymmetryPrior, policy_consistency_loss
+from esp_cli.prior.config import PriorConfig
 from esp_cli.symmetry import transform_set
 from esp_envs import make
 
