@@ -1,8 +1,8 @@
 """ESP itself: symmetry as augmentation and as a consistency loss, one object that any learner is given."""
 
 from esp_cli.prior.copies import Copies
-from esp_cli.prior.losses import Loss, Term, policy_consistency_loss, value_consistency_loss
-from esp_cli.prior.seed_batch import SeedBatch, average, mean_per_seed, shares
+from esp_cli.prior.losses import Loss, Term, value_consistency_loss
+from esp_cli.prior.seed_batch import SeedBatch, mean_per_seed, shares
 from esp_cli.prior.symmetry_prior import Answers, SymmetryPrior
 
 __all__ = [
@@ -12,9 +12,7 @@ __all__ = [
     "SeedBatch",
     "SymmetryPrior",
     "Term",
-    "average",
     "mean_per_seed",
-    "policy_consistency_loss",
     "shares",
     "value_consistency_loss",
 ]
