@@ -15,7 +15,8 @@ from esp_cli.algorithms.adam import SeedAdam
 from esp_cli.files.documents import Strict
 from esp_cli.networks.contract import Generators, NetworkConfig
 from esp_cli.networks.policy import Policy
-from esp_cli.prior import PriorConfig, SymmetryPrior
+from esp_cli.prior import SymmetryPrior
+from esp_cli.prior.config import PriorConfig
 from esp_envs.base import Environment, generator_states, restore_generators
 from esp_envs.errors import UserError
 from esp_envs.spec import TaskSpec

@@ -13,7 +13,7 @@ from esp_cli.algorithms.learner import Iteration, Learner
 from esp_cli.networks.contract import Generators, NetworkConfig
 from esp_cli.networks.policy import Policy
 from esp_cli.networks.roles import RolesPolicy
-from esp_cli.prior import PriorConfig
+from esp_cli.prior.config import PriorConfig
 from esp_cli.symmetry import Group
 from esp_cli.symmetry.admission import admitted_elements, unrestricted
 from esp_envs.base import Environment

@@ -10,10 +10,11 @@ from contextlib import suppress
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from esp_cli.checking.shifting import Shift
 from esp_cli.symmetry import Element, FiniteGroup, Group, build_transform, parse_elements
-from esp_cli.symmetry.admission import DISCOVERED, declares, exchangeable, scene_of
+from esp_cli.symmetry.admission import DISCOVERED, declares, exchangeable, moves_some_number, scene_of
 from esp_cli.symmetry.elements import order_name
 from esp_cli.symmetry.groups import MOST_ITEMS
 from esp_cli.symmetry.plane import PlaneElement, mirror
@@ -77,26 +78,26 @@ def _defaults(spaces: Spaces) -> list[str]:
 def _refusal(element: Element, spaces: Spaces) -> str | None:
     """Say why an element cannot be tried, if it cannot: actions or layouts cannot carry it, or it moves nothing."""
     try:
-        transform = build_transform([element], spaces)
+        build_transform([element], spaces)
     except ValueError as error:
         return str(error)
-    return f"{element.name} moves no number of it" if transform.is_identity else None
+    return None if moves_some_number([element], spaces) else f"{element.name} moves no number of it"
 
 
 def _moved(element: Element, spaces: Spaces) -> tuple[float, ...]:
     """Return where an element moves some numbers of a task, in thousandths: the same for those that move all alike."""
     transform, agents = build_transform([element], spaces), spaces.num_agents
     generator = torch.Generator().manual_seed(0)
-    obs, state = (
-        torch.rand(1, 1, *shape, generator=generator, dtype=torch.float64).float()
-        for shape in ((agents, spaces.observation.width), (spaces.state.width,))
+
+    def drawn(*shape: int) -> Tensor:
+        return torch.rand(1, 1, *shape, generator=generator, dtype=torch.float64).float()
+
+    parts = (
+        transform.obs(drawn(agents, spaces.observation.width)),
+        transform.state(drawn(spaces.state.width)),
+        transform.push_outputs(drawn(agents, transform.num_outputs)),
+        transform.per_agent(torch.arange(float(agents)).view(1, 1, -1)),
     )
-    if isinstance(spaces.action, Discrete):
-        action = torch.arange(spaces.action.count).view(1, -1, 1).expand(1, -1, agents)
-    else:
-        action = torch.rand(1, 1, agents, spaces.action.width, generator=generator)
-    order = transform.per_agent(torch.arange(float(agents)).view(1, 1, -1))
-    parts = (transform.obs(obs), transform.state(state), transform.action(action), order)
     return tuple(round(1000 * number) + 0.0 for part in parts for number in part.flatten().tolist())
 
 

@@ -9,7 +9,6 @@ from torch import Tensor
 from torch import distributions as td
 
 from esp_cli.loop.shapes import check_alike
-from esp_cli.prior.losses import policy_consistency_loss
 from esp_cli.symmetry import Transform
 from esp_envs.errors import UserError
 
@@ -35,9 +34,10 @@ def policy_divergence(transform: Transform, there: Policy, here: Policy, samples
     if transform.action_index is not None:
         if all(isinstance(p, Tensor | td.Categorical | td.OneHotCategorical) for p in (there, here)):
             logits = (p if isinstance(p, Tensor) else p.logits for p in (there, here))
-            return policy_consistency_loss(_choices_apart, *_both(transform, *logits))
+            return _choices_apart(*_both(transform, *logits))
     elif isinstance(there, Tensor) and isinstance(here, Tensor):
-        return policy_consistency_loss(lambda p, q: 0.5 * (p - q).square().sum(-1), *_both(transform, there, here))
+        pulled, own = _both(transform, there, here)
+        return 0.5 * (pulled - own).square().sum(-1)
     elif isinstance(there, td.Normal) and isinstance(here, td.Normal):
         return _normals_apart(transform, there, here)
     elif _is_squashed(there) and _is_squashed(here):
@@ -45,7 +45,7 @@ def policy_divergence(transform: Transform, there: Policy, here: Policy, samples
         check_alike("policy", [inner.loc], own.loc)
         if _commutes(transform, own.loc, here.transforms):
             return _normals_apart(transform, inner, own)
-        return policy_consistency_loss(lambda p, q: _samples_apart(transform, p, q, samples), there, here)
+        return _samples_apart(transform, there, here, samples)
     if isinstance(there, Tensor) != isinstance(here, Tensor):
         raise UserError(
             f"the policy says {type(there).__name__} of the moved data, but of the originals (here) there is "
@@ -95,14 +95,10 @@ def _choices_apart(p: Tensor, q: Tensor) -> Tensor:
 
 def _normals_apart(transform: Transform, there: td.Normal, here: td.Normal) -> Tensor:
     """Return KL[N(K^-1 m', K^-1 diag(v') K) || N(m, diag(v))]."""
-    pulled = _both(transform, there.loc, here.loc)
+    mean, own = _both(transform, there.loc, here.loc)
     variance, volume = transform.pull_back_variance(there.variance), transform.values(there.variance.log().sum(-1))
-
-    def divergence(mean: Tensor, own: Tensor) -> Tensor:
-        ratio = (variance + (own - mean).square()) / here.variance
-        return 0.5 * ((ratio - 1 + here.variance.log()).sum(-1) - volume)
-
-    return policy_consistency_loss(divergence, *pulled)
+    ratio = (variance + (own - mean).square()) / here.variance
+    return 0.5 * ((ratio - 1 + here.variance.log()).sum(-1) - volume)
 
 
 @torch.no_grad()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Generic
 import torch
 from torch import Tensor
 
-from esp_cli.prior.losses import Loss, OfGraph, Term, Values, policy_consistency_loss, policy_gap, value_gap
+from esp_cli.prior.losses import Loss, OfGraph, Term, Values, consistency_gap
 from esp_cli.prior.seed_batch import Rows, average, shares
 from esp_cli.symmetry import Transform
 from esp_cli.symmetry.frame import Frame
@@ -129,13 +129,13 @@ class Copies(Generic[Rows]):
     def _gaps(self, policy: tuple[Any, Any] | None, value: Any) -> dict[str, Loss]:
         gaps, rows = dict[str, Loss](), self.originals
         if policy is not None and hasattr(policy[0], "policies"):
-            gaps["policy"] = Loss(Term(self.policies(*policy), 1.0, policy_gap(rows.mask)))
+            gaps["policy"] = Loss(Term(self.policies(*policy), 1.0, consistency_gap(rows.mask)))
         elif policy is not None:
             head, outputs = policy[0], self.frame.pull_outputs(policy[1])
-            gap = policy_consistency_loss(head.divergence, outputs[:, 1:], outputs[:, :1]).flatten(2)
+            gap = head.divergence(outputs[:, 1:], outputs[:, :1]).flatten(2)
             gaps["policy"] = Loss.of(average(gap, shares(rows.mask, gap.shape)))
         if value is not None:
-            gaps["value"] = Loss(Term(self.values(value), 1.0, value_gap(rows.valued(_returned(value).size[-1]))))
+            gaps["value"] = Loss(Term(self.values(value), 1.0, consistency_gap(rows.valued(_returned(value).size[-1]))))
         return gaps
 
 

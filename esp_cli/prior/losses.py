@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.autograd import Function
 
 from esp_cli.prior.seed_batch import average, shares
 from esp_cli.symmetry.frame import Frame
@@ -95,8 +94,9 @@ class Loss:
                 elif root.graph.requires_grad:
                     graphs.append((root.graph, slope))
         if graphs:
-            roots = [_WithSlope.apply(*pair) for pair in graphs]  # type: ignore[no-untyped-call]
-            total = sum(roots[1:], start=roots[0])
+            # a number: given slopes as gradients of vectors, torch imports sympy for a second
+            totals = [(graph * slope).sum() for graph, slope in graphs]
+            total = sum(totals[1:], start=totals[0])
             by = torch.autograd.grad(total, parameters, allow_unused=True, materialize_grads=True)
             found.append((parameters, [*by]))
         return found
@@ -129,6 +129,20 @@ class Values:
         """[S, P, R] in the frame."""
         return self._frame.pull_values(self._values.tensor).flatten(2)
 
+    def divergence(self, copies: slice, originals: slice) -> Tensor:
+        """Return S_V or S_Q of some parts."""
+        return value_consistency_loss(self.rows[:, copies], self.rows[:, originals])
+
+    def add_divergence_slope(self, slope: Any, weights: Tensor | float) -> Any:
+        """Add the slope of the sum of divergences times weights."""
+        if not (slope is None or isinstance(slope, Tensor)):
+            return slope._replace(gap_weight=weights)
+        slope = torch.zeros_like(self.rows) if slope is None else slope
+        by_copies = (self.rows[:, 1:] - self.rows[:, :1]).mul_(2 * weights)
+        slope[:, 1:].add_(by_copies)
+        slope[:, :1].sub_(by_copies if by_copies.shape[1] == 1 else by_copies.sum(1, keepdim=True))
+        return slope
+
     def back(self, slope: Any) -> list[tuple[Any, Any]]:
         if not isinstance(slope, Tensor):
             return [(self._values.learn(slope.learn, self.sizes[1]), slope)]
@@ -148,30 +162,9 @@ class OfGraph:
         return [(self, slope)]
 
 
-class _WithSlope(Function):
-    """A number whose gradient by x is the slope; given gradients of vectors, torch imports sympy for a second."""
-
-    @staticmethod
-    def forward(ctx, x, slope):  # type: ignore[no-untyped-def]
-        ctx.slope = slope
-        return x.new_zeros(())
-
-    @staticmethod
-    def backward(ctx, _):  # type: ignore[no-untyped-def]
-        return ctx.slope, None
-
-
 def _itself(on: OfGraph, weight: float, slope: Tensor | None) -> Stated:
     own = torch.full_like(on.tensor, weight)
     return Stated(lambda: on.tensor, None, own if slope is None else slope + own)
-
-
-def policy_consistency_loss(divergence: Callable[[Any, Any], Tensor], pulled_back: Any, original: Any) -> Tensor:
-    """Return S_pi = KL[pi(K_g . | L_g s) || pi(. | s)] (Eq. 8), [S, B, N], with the divergence of a policy head.
-
-    Outputs [S, B, N, A] at L_g s are `pulled_back` by K_g: action a has the weight of K_g a.
-    """
-    return divergence(pulled_back, original)
 
 
 def value_consistency_loss(transformed: Tensor, original: Tensor) -> Tensor:
@@ -179,34 +172,13 @@ def value_consistency_loss(transformed: Tensor, original: Tensor) -> Tensor:
     return (original - transformed).square()
 
 
-def policy_gap(mask: Tensor | None) -> Equation:
-    """Return the mean of S_pi over copies and rows that count, as an equation on `networks.policies.Policies`."""
+def consistency_gap(mask: Tensor | None) -> Equation:
+    """Return the mean of S_pi, S_V or S_Q over copies and rows that count, as an equation on policies or on values."""
 
-    def equation(policies: Any, weight: float, slope: Any) -> Stated:
-        num_seeds, num_parts, num_rows = policies.sizes
+    def equation(on: Any, weight: float, slope: Any) -> Stated:
+        num_seeds, num_parts, num_rows = on.sizes
         share = shares(mask, (num_seeds, num_parts - 1, num_rows))
-        slope = policies.add_divergence_slope(slope, weight * share)
-        return Stated(lambda: policy_consistency_loss(policies.divergence, slice(1, None), slice(0, 1)), share, slope)
-
-    return equation
-
-
-def value_gap(mask: Tensor | None) -> Equation:
-    """Return the mean of S_V (S_Q) over copies and rows that count, as an equation on `Values`."""
-
-    def equation(values: Values, weight: float, slope: Tensor | None) -> Stated:
-        num_seeds, num_parts, num_rows = values.sizes
-        share = shares(mask, (num_seeds, num_parts - 1, num_rows))
-
-        def stated() -> Tensor:
-            return value_consistency_loss(values.rows[:, 1:], values.rows[:, :1])
-
-        if not (slope is None or isinstance(slope, Tensor)):
-            return Stated(stated, share, slope._replace(gap_weight=weight * share))
-        slope = torch.zeros_like(values.rows) if slope is None else slope
-        by_copies = (values.rows[:, 1:] - values.rows[:, :1]).mul_(2 * weight * share)
-        slope[:, 1:].add_(by_copies)
-        slope[:, :1].sub_(by_copies if by_copies.shape[1] == 1 else by_copies.sum(1, keepdim=True))
-        return Stated(stated, share, slope)
+        slope = on.add_divergence_slope(slope, weight * share)
+        return Stated(lambda: on.divergence(slice(1, None), slice(0, 1)), share, slope)
 
     return equation

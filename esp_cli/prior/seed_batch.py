@@ -119,7 +119,4 @@ def shares(mask: Tensor | None, shape: Sequence[int]) -> Tensor | float:
 
 def average(x: Tensor, share: Tensor | float) -> Tensor:
     """Return the mean [S] of x [S, P, R] with these shares; 0 where nothing counts."""
-    if isinstance(share, float):
-        return x.flatten(1).mean(1)
-    counts = (share > 0).expand_as(x)
-    return torch.where(counts, x, 0.0).flatten(1).sum(1) / counts.flatten(1).sum(1).clamp_min(1)
+    return mean_per_seed(x, None if isinstance(share, float) else (share > 0).expand_as(x))

@@ -4,7 +4,7 @@ from esp_cli.symmetry.admission import admit, admit_declared, carried_groups, de
 from esp_cli.symmetry.elements import Element, Geometry
 from esp_cli.symmetry.groups import FiniteGroup, Group, agent_permutations, direct_product, item_orders
 from esp_cli.symmetry.parse import parse_elements, parse_group
-from esp_cli.symmetry.plane import PlaneElement, cyclic, dihedral, mirror, orthogonal, rotation, special_orthogonal
+from esp_cli.symmetry.plane import PlaneElement, cyclic, dihedral, mirror, rotation
 from esp_cli.symmetry.transforms import Transform, TransformSet, build_transform, transform_set
 
 __all__ = [
@@ -26,10 +26,8 @@ __all__ = [
     "direct_product",
     "item_orders",
     "mirror",
-    "orthogonal",
     "parse_elements",
     "parse_group",
     "rotation",
-    "special_orthogonal",
     "transform_set",
 ]

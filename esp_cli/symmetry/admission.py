@@ -8,7 +8,6 @@ from dataclasses import replace
 from esp_cli.symmetry import representation
 from esp_cli.symmetry.elements import AGENTS, Element
 from esp_cli.symmetry.groups import MOST_ITEMS, Group, ProductGroup
-from esp_cli.symmetry.maps import map_of
 from esp_cli.symmetry.parse import declared_factors, is_item_name, parse_elements, rank
 from esp_envs.errors import UserError
 from esp_envs.roles import without_agents
@@ -82,7 +81,8 @@ def default_transforms(spaces: Spaces, weighed: bool = False) -> str:
     declared = _factors(spaces)
     listed = [name for name in declared[:1] if name != "so2"]
     chosen = next((name for name in ("d4", *listed, "c4", *declared) if carries(name, spaces)), "d4")
-    if not weighed or not carries("d4", unrestricted(spaces)) or not _moves_some_number("d4", spaces):
+    d4 = _generating(parse_elements("d4", spaces.num_agents))
+    if not weighed or not carries("d4", unrestricted(spaces)) or not moves_some_number(d4, spaces):
         return chosen
     found = parse_elements(chosen, spaces.num_agents)
     if isinstance(found, Group) or len(found) > _FEW_ORDERS:
@@ -90,11 +90,11 @@ def default_transforms(spaces: Spaces, weighed: bool = False) -> str:
     return f"d4,{chosen}" if all(element.orders for element in found) else "d4"
 
 
-def _moves_some_number(name: str, spaces: Spaces) -> bool:
-    elements = _generating(parse_elements(name, spaces.num_agents))
+def moves_some_number(elements: Sequence[Element], spaces: Spaces) -> bool:
+    """Return whether some element moves a number of a task, as a turn of scalars alone does not."""
     seen = representation.rows_operator(spaces.observation, elements, spaces.num_agents)
     moved = (seen, representation.state_operator(spaces, elements), representation.output_operator(spaces, elements))
-    return not all(map_of(each).is_identity for each in moved)
+    return not all(operator.is_identity for operator in moved)
 
 
 def _all_carry(name: str, roles: Sequence[TaskSpec], weighed: bool) -> bool:

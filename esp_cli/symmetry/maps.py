@@ -45,10 +45,6 @@ class Dense:
         return _product(rows, self.matrix)
 
     @property
-    def is_identity(self) -> bool:
-        return torch.equal(self.matrix, torch.eye(self.width).to(self.matrix).expand_as(self.matrix))
-
-    @property
     def squared(self) -> Dense:
         """The map whose entries are squared: how variances of independent numbers move."""
         return Dense(self.matrix.square())
@@ -93,11 +89,6 @@ class Gather:
     def pull(self, rows: Tensor) -> Tensor:
         signed = rows if self.sign is None else rows * self.sign[:, None, :].to(rows.dtype)
         return signed.gather(2, self.back[:, None, :].expand(rows.shape))
-
-    @property
-    def is_identity(self) -> bool:
-        stays = torch.equal(self.source, torch.arange(self.width).to(self.source).expand_as(self.source))
-        return stays and (self.sign is None or bool((self.sign == 1).all()))
 
     @property
     def squared(self) -> Gather:
@@ -155,11 +146,7 @@ def trivial(group: FiniteGroup, copies: int) -> Block:
 
 def regular(group: FiniteGroup, copies: int) -> Block:
     """Return features of one number per element h, which g moves from h to g h: a group convolution's channels."""
-    columns = np.arange(group.order)
-    matrices = np.zeros((group.order,) * 3)
-    for g, row in enumerate(group.product):
-        matrices[g, row, columns] = 1.0
-    return Block(matrices, copies)
+    return Block(Operator.moving(group.product).matrix, copies)
 
 
 def layout_blocks(layout: Layout, group: FiniteGroup) -> list[Block]:
@@ -175,10 +162,7 @@ def action_blocks(action: ActionSpace, group: FiniteGroup) -> list[Block]:
     """Return how one number per discrete action, or the numbers of a continuous one, transform."""
     if not isinstance(action, Discrete):
         return layout_blocks(action.layout, group)
-    places = action_map(action, group.elements)
-    matrices = np.zeros((group.order, action.count, action.count))
-    np.put_along_axis(matrices, places[:, None, :], 1.0, axis=1)
-    return [Block(matrices, 1)]
+    return [Block(Operator.moving(action_map(action, group.elements)).matrix, 1)]
 
 
 def with_pixels(block: Block, side: int, group: FiniteGroup) -> Block:

@@ -96,17 +96,13 @@ def rank(group: Group) -> tuple[int, str]:
     return (1, "") if names == [AGENTS] else (2, min(names))
 
 
-def _moves_scene(group: Group) -> bool:
-    """Return whether a group leaves all agents and items in their places."""
-    return not any(isinstance(aspect, str) for aspect in group.aspects)
-
-
 def _item(part: str, text: str, num_agents: int) -> tuple[Element, ...] | Group:
     factors = [_factor(word.strip(), text, num_agents) for word in part.split("*")]
     groups = [factor for factor in factors if isinstance(factor, Group)]
     if len(groups) == len(factors):
-        ordered = len(groups) == 1 or not _moves_scene(groups[-1])
-        if are_independent(groups) and (ordered or all(map(_moves_scene, groups))):
+        of_scene = [rank(group)[0] == 0 for group in groups]
+        ordered = len(groups) == 1 or not of_scene[-1]
+        if are_independent(groups) and (ordered or all(of_scene)):
             group = direct_product(*sorted(groups, key=rank))
             return group.elements if isinstance(group, FiniteGroup) else group
         if ordered:

@@ -206,16 +206,6 @@ def dihedral(n: int) -> FiniteGroup:
     return FiniteGroup.generated_by(f"d{n}", [PlaneElement(Fraction(1, n)), mirror()])
 
 
-def special_orthogonal() -> PlaneGroup:
-    """Return SO(2)."""
-    return PlaneGroup(mirrors=False)
-
-
-def orthogonal() -> PlaneGroup:
-    """Return O(2)."""
-    return PlaneGroup(mirrors=True)
-
-
 BODY_NAMES = {"left-right": "flip-x", "front-back": "flip-y", "half-turn": "rot180", "quarter-turn": "rot90"}
 """What a robot that faces x calls elements."""
 

@@ -41,6 +41,11 @@ class Operator:
         return cls(order[:, :, None], np.ones((*order.shape, 1)))
 
     @classmethod
+    def moving(cls, places: Indices) -> Operator:
+        """Return the operator that puts old number k at place places[g, k]: [G, D]."""
+        return cls.reordering(np.argsort(places, axis=1))
+
+    @classmethod
     def beside(cls, parts: Sequence[Operator], num_elements: int) -> Operator:
         """Return the operator of rows laid end to end, each with its own."""
         starts = np.cumsum([0, *(part.width for part in parts)])
@@ -89,6 +94,12 @@ class Operator:
     def selected(self, index: Sequence[int]) -> Operator:
         return Operator(self.source[index], self.weight[index])
 
+    @property
+    def is_identity(self) -> bool:
+        """Whether every number stays as it is, for all elements."""
+        stays = self.source == np.arange(self.width)[:, None]
+        return bool((np.where(stays, self.weight, 0).sum(2) == 1).all()) and not self.weight[~stays].any()
+
 
 def rows_operator(layout: Layout, elements: Sequence[Element], num_agents: int) -> Operator:
     """Return L_g of an agent's row of D numbers, or where agents move of all N rows end to end.
@@ -115,7 +126,11 @@ def state_operator(spaces: Spaces, elements: Sequence[Element]) -> Operator:
 def _numbers_operator(layout: Layout, elements: Sequence[Element], places: Indices | None) -> Operator:
     """Return L_g of numbers of a state that are not the agents' rows; items of AGENTS follow them."""
     part = layout_operator(layout, elements)
-    return part if places is None or not layout.fields else part.ordered(state_sources(layout, places))
+    if places is None or not layout.fields:
+        return part
+    if field := next((field for field in layout.fields if field.items is Items.OTHERS), None):
+        raise UserError(f"state field '{field.name}' counts others, but a state has no observer; count agents")
+    return part.ordered(_sources(layout, np.argsort(places, axis=1)[:, None])[:, 0])
 
 
 def output_operator(spaces: Spaces, elements: Sequence[Element]) -> Operator:
@@ -123,7 +138,7 @@ def output_operator(spaces: Spaces, elements: Sequence[Element]) -> Operator:
     action, places = spaces.action, agent_places(elements, spaces.num_agents)
     if not isinstance(action, Discrete):
         return rows_operator(action.layout, elements, spaces.num_agents)
-    row = Operator.reordering(np.argsort(action_map(action, elements), axis=1))
+    row = Operator.moving(action_map(action, elements))
     if places is None:
         return row
     return row.repeated(spaces.num_agents).ordered(numbers_of(np.argsort(places, axis=1), action.count))
@@ -231,15 +246,6 @@ def require_items(elements: Sequence[Element], spaces: Spaces) -> None:
     for name in dict.fromkeys(name for element in elements for name, _ in element.items):
         if name not in known:
             raise UserError(f"{spaces.label} has no field '{name}', but {', '.join(known)}")
-
-
-def state_sources(layout: Layout, places: Indices) -> Indices:
-    """Return [G, Ds]: where each number of a state comes from when its AGENTS items follow the agents to `places`."""
-    came_from = np.argsort(places, axis=1)
-    for field in layout.fields:
-        if field.items is Items.OTHERS:
-            raise UserError(f"state field '{field.name}' counts others, but a state has no observer; count agents")
-    return _sources(layout, came_from[:, None])[:, 0]
 
 
 def joint_sources(layout: Layout, places: Indices) -> Indices:

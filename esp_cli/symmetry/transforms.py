@@ -50,12 +50,6 @@ class Transform:
         """S, or 1 for a transform that is the same for all seeds."""
         return len(self.elements)
 
-    @property
-    def is_identity(self) -> bool:
-        """Whether it moves no number of the task, as a turn of scalars alone."""
-        maps = (self.obs_map, self.state_map, self.output_map)
-        return all(m.is_identity for m in maps) and (self.agents is None or self.agents.is_identity)
-
     @cached_property
     def orders(self) -> Tensor | None:
         """Which output is each action's, at s and at L_g s, [S, 2, A] int64; None where signs change or agents move."""
@@ -161,7 +155,7 @@ def build_transform(
     seen = representation.rows_operator(spaces.observation, elements, spaces.num_agents)
     return Transform(
         elements=tuple(elements),
-        agents=None if places is None else gather_of(representation.Operator.reordering(places.argsort(1)), device),
+        agents=None if places is None else gather_of(representation.Operator.moving(places), device),
         obs_map=map_of(seen, device, dtype),
         state_map=map_of(state, device, dtype),
         output_map=map_of(outputs, device, dtype) if image is None else gather_of(outputs, device),
@@ -240,21 +234,17 @@ class TransformSet:
         if self._stack is None:
             elements = (*self._elements, Element())
             return self._build([elements[i] for i in picks])
-        return self._single(*picks) if len(picks) == 1 else self._stack.select(picks)
+        if len(picks) > 1:
+            return self._stack.select(picks)
+        if picks[0] not in self._singles:
+            self._singles[picks[0]] = self._stack.select(picks)
+        return self._singles[picks[0]]
 
     def each(self) -> list[Transform]:
         """Return every element of a finite group in order, each the same for all seeds."""
         if not self.is_finite:
             raise UserError(f"{self.names[0]} cannot be listed; draw from it or choose a finite group")
-        if self._stack is not None:
-            return [self._single(i) for i in range(self.size)]
-        return [self._build([e]) for e in self._elements]
-
-    def _single(self, index: int) -> Transform:
-        assert self._stack is not None
-        if index not in self._singles:
-            self._singles[index] = self._stack.select([index])
-        return self._singles[index]
+        return [self.chosen([i]) for i in range(self.size)]
 
     def _build(self, elements: Sequence[Element]) -> Transform:
         return build_transform(elements, self.spaces, self.device, self.dtype)

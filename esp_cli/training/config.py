@@ -16,7 +16,7 @@ from esp_cli.files.documents import Strict, parse_value, validate, validated, wi
 from esp_cli.files.formatting import nearest, shortened
 from esp_cli.networks.build import AnyNetworkConfig, network_class
 from esp_cli.networks.plain import MlpConfig
-from esp_cli.prior import PriorConfig
+from esp_cli.prior.config import PriorConfig
 from esp_cli.symmetry import default_transforms
 from esp_cli.symmetry.admission import carries
 from esp_envs.errors import UserError

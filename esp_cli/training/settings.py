@@ -14,7 +14,7 @@ from esp_cli.defaults import __version__
 from esp_cli.files.documents import flat, read_table, validate
 from esp_cli.files.formatting import did_you_mean, shortened
 from esp_cli.networks.build import NETWORKS
-from esp_cli.prior import PriorConfig
+from esp_cli.prior.config import PriorConfig
 from esp_cli.training.config import SECTIONS, EvaluationConfig, RunConfig, completed
 from esp_cli.training.run_folder import RunFolder, read_run_config
 from esp_envs.errors import UserError

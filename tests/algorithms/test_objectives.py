@@ -22,7 +22,8 @@ from esp_cli.networks.contract import WithVJP
 from esp_cli.networks.heads import Categorical
 from esp_cli.networks.plain import MlpConfig
 from esp_cli.networks.policy import StochasticPolicy
-from esp_cli.prior import Loss, PriorConfig, SeedBatch, SymmetryPrior, copies, mean_per_seed
+from esp_cli.prior import Loss, SeedBatch, SymmetryPrior, copies, mean_per_seed
+from esp_cli.prior.config import PriorConfig
 from esp_cli.prior.losses import value_consistency_loss
 from esp_cli.symmetry import transform_set
 from esp_envs import Field, Kind, Spaces, layout
@@ -350,21 +351,27 @@ def test_every_gradient_of_a_default_run_goes_through_the_equations(monkeypatch)
     counted(mappo, "ppo_loss")
     for module in (mappo, maddpg, qmix):
         counted(module, "value_loss")
-    counted(copies, "policy_gap")
-    counted(copies, "value_gap")
+    gap = copies.Term
+
+    def term(on, *rest):
+        name = "S_V" if isinstance(on, copies.Values) else "S_pi"
+        counts[name] = counts.get(name, 0) + 1
+        return gap(on, *rest)
+
+    monkeypatch.setattr(copies, "Term", term)
     counted(copies.Copies, "penalty")
     counted(mappo.SeedAdam, "gradient")
     trained = learner()
     trained.iterate(0.0)
     # two epochs of two minibatches; the symmetry errors are measured once
     steps = {"gradient": 4, "ppo_loss": 4, "penalty": 4, "value_loss": 4}
-    assert counts == steps | {"policy_gap": 4 + 1, "value_gap": 4 + 1}
+    assert counts == steps | {"S_pi": 4 + 1, "S_V": 4 + 1}
     for algorithm, actor in (("maddpg", 1), ("qmix", 0)):
         trained = learners.learner(algorithm)
         batch = [trained.iterate(0.0), trained.iterate(0.0)] and trained.replay.sample(3, trained.generators["learner"])
         counts.clear()
         trained.update(batch)
-        once = {"policy_gap": 1, "value_gap": 1} if actor else {"value_gap": 1}
+        once = {"S_pi": 1, "S_V": 1} if actor else {"S_V": 1}
         assert counts == {"gradient": 1 + actor, "penalty": 1 + actor, "value_loss": 1} | once
 
 
@@ -373,10 +380,10 @@ def test_every_gradient_of_a_default_run_goes_through_the_equations(monkeypatch)
     [
         ("Eq. 3", {"ppo_loss"}),
         ("Eq. 4", {"value_loss"}),
-        ("Eq. 8, S_pi", {"policy_gap"}),
-        ("Eq. 9, S_V", {"value_gap"}),
+        ("Eq. 8, S_pi", {"consistency_gap", "CategoricalPolicies.divergence"}),
+        ("Eq. 9, S_V", {"consistency_gap", "value_consistency_loss"}),
         ("Eq. 10, c", {"Copies.penalty"}),
-        ("supplement eq. 19, S_Q", {"value_gap"}),
+        ("supplement eq. 19, S_Q", {"consistency_gap", "value_consistency_loss"}),
     ],
 )
 def test_the_page_points_at_the_functions_that_are_counted_above(equation, functions):

@@ -19,7 +19,8 @@ from torch import Tensor
 from esp_cli import Symmetry, Transitions
 from esp_cli.networks.constrained import EquivariantConfig
 from esp_cli.networks.contract import IoSpec
-from esp_cli.prior import PriorConfig, SeedBatch, SymmetryPrior
+from esp_cli.prior import SeedBatch, SymmetryPrior
+from esp_cli.prior.config import PriorConfig
 from esp_cli.symmetry import (
     Element,
     FiniteGroup,

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from esp_cli.algorithms.mappo import Mappo, MappoConfig
 from esp_cli.networks.plain import MlpConfig
-from esp_cli.prior import PriorConfig
+from esp_cli.prior.config import PriorConfig
 from esp_cli.symmetry import transform_set
 from esp_cli.training.build import PolicyController, ScriptedController, generators, stream_seeds
 from tests.learning.pointing import HORIZON, SEEDS, AlwaysRight, Pointing, iterations_to, score

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.networks.plain import MlpConfig
-from esp_cli.prior import PriorConfig
+from esp_cli.prior.config import PriorConfig
 from esp_cli.training.build import PolicyController, generators, stream_seeds
 from tests.learning.pointing import SEEDS, AlwaysRight, Pointing, score
 

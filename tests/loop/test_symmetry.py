@@ -13,7 +13,8 @@ from torch.distributions import Normal
 
 from esp_cli import Continuous, Field, Items, Kind, Symmetry, Transitions, discrete_moves, layout
 from esp_cli.networks.heads import Categorical
-from esp_cli.prior import PriorConfig, SeedBatch, SymmetryPrior
+from esp_cli.prior import SeedBatch, SymmetryPrior
+from esp_cli.prior.config import PriorConfig
 from esp_envs import make
 
 SEEN = layout(Field("velocity", Kind.VECTOR), Field("load", Kind.SCALAR))

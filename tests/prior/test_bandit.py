@@ -5,8 +5,9 @@ import math
 import pytest
 import torch
 
-from esp_cli.prior import PriorConfig, SymmetryPrior
+from esp_cli.prior import SymmetryPrior
 from esp_cli.prior.bandit import WINDOW, Bandit
+from esp_cli.prior.config import PriorConfig
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
 from esp_envs import make

@@ -5,7 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from esp_cli.prior import PriorConfig, SeedBatch, SymmetryPrior
+from esp_cli.prior import SeedBatch, SymmetryPrior
+from esp_cli.prior.config import PriorConfig
 from esp_cli.symmetry import build_transform, mirror, rotation
 from esp_envs import Field, Items, Kind, Spaces, layout
 from esp_envs.spec import DOWN, LEFT, RIGHT, UP, Discrete

@@ -11,7 +11,8 @@ import torch
 
 from esp_cli.checking.measured import prepared
 from esp_cli.policies.loading import TrainedPolicy
-from esp_cli.prior import PriorConfig, SymmetryPrior
+from esp_cli.prior import SymmetryPrior
+from esp_cli.prior.config import PriorConfig
 from esp_cli.run import Run
 from esp_cli.symmetry import build_transform, mirror, parse_elements, rotation, transform_set
 from esp_cli.training.build import build_environment

@@ -5,40 +5,43 @@ import math
 import pytest
 import torch
 
-from esp_cli.prior import PriorConfig, SymmetryPrior, policy_consistency_loss
+from esp_cli.networks.policies import CategoricalPolicies
+from esp_cli.prior import SymmetryPrior
+from esp_cli.prior.config import PriorConfig
+from esp_cli.prior.losses import OfGraph
 from esp_cli.symmetry import transform_set
+from esp_cli.symmetry.frame import Frame
 from esp_envs import make
 
 SPEC = make("navigation", 1, [0]).spec
 
 
-def log_probs(*weights):
-    return torch.tensor(weights).log().view(1, 1, 1, -1)
+ROT90 = transform_set("rot90", SPEC, "cpu").each()[0]
 
 
-def divergence(p, q):
-    return (p.exp() * (p - q)).sum(-1)
+def gap(there, here):
+    """Return S_pi of probabilities [A] at rot90(s) and at s, for each of three agents."""
+    outputs = torch.stack([torch.as_tensor(x).log().expand(1, 3, -1) for x in (here, there)]).unsqueeze(0)
+    return CategoricalPolicies(OfGraph(outputs), Frame([ROT90])).divergence(slice(1, None), slice(0, 1)).view(3)
 
 
 def test_policy_consistency_is_the_divergence_of_the_pulled_back_policy_from_the_original():
-    pulled, original = log_probs(0.5, 0.5), log_probs(0.25, 0.75)
-    forward = 0.5 * math.log(0.5 / 0.25) + 0.5 * math.log(0.5 / 0.75)
-    backward = 0.25 * math.log(0.25 / 0.5) + 0.75 * math.log(0.75 / 0.5)
-    assert policy_consistency_loss(divergence, pulled, original).item() == pytest.approx(forward, rel=1e-5)
+    pulled, original = torch.tensor([0.4, 0.4, 0.1, 0.05, 0.05]), torch.tensor([0.2, 0.6, 0.1, 0.05, 0.05])
+    forward = 0.4 * math.log(0.4 / 0.2) + 0.4 * math.log(0.4 / 0.6)
+    backward = 0.2 * math.log(0.2 / 0.4) + 0.6 * math.log(0.6 / 0.4)
+    there = ROT90.push_outputs(pulled.expand(1, 3, -1))[0, 0]
+    assert gap(there, original).tolist() == pytest.approx([forward] * 3, rel=1e-5)
     assert forward != pytest.approx(backward, rel=1e-3), "the direction matters"
 
 
 def test_policy_consistency_vanishes_exactly_where_the_policy_turns_with_the_world():
     """A policy that goes up in s must go left in rot90(s)."""
-    g = transform_set("rot90", SPEC, "cpu").each()[0]
     names = SPEC.action.names
-    here, turned = torch.full((1, 1, 3, 5), 0.05), torch.full((1, 1, 3, 5), 0.05)
-    here[..., names.index("up")] = turned[..., names.index("left")] = 0.8
-    loss = policy_consistency_loss(divergence, g.pull_back(turned.log()), here.log())
-    torch.testing.assert_close(loss, torch.zeros(1, 1, 3), atol=1e-6, rtol=0)
-    stubborn = policy_consistency_loss(divergence, g.pull_back(here.log()), here.log())
+    here, turned = torch.full((5,), 0.05), torch.full((5,), 0.05)
+    here[names.index("up")] = turned[names.index("left")] = 0.8
+    torch.testing.assert_close(gap(turned, here), torch.zeros(3), atol=1e-6, rtol=0)
     # negative control: 0.75 log 16 for the two swapped probabilities
-    torch.testing.assert_close(stubborn, torch.full((1, 1, 3), 0.75 * math.log(16)))
+    torch.testing.assert_close(gap(here, here), torch.full((3,), 0.75 * math.log(16)))
 
 
 @pytest.mark.parametrize(

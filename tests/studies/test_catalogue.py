@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from esp_cli.checking import measured
-from esp_cli.prior import PriorConfig
+from esp_cli.prior.config import PriorConfig
 from esp_cli.studies.catalogue import Request, plan, without_effect
 from esp_cli.studies.kinds import KINDS
 from esp_cli.studies.paper import Reported, horizons, reported, tasks

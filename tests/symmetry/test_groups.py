@@ -16,11 +16,10 @@ from esp_cli.symmetry import (
     direct_product,
     item_orders,
     mirror,
-    orthogonal,
     rotation,
-    special_orthogonal,
 )
 from esp_cli.symmetry.groups import swap_and_round
+from esp_cli.symmetry.plane import PlaneGroup
 
 ORDERS = {
     "c1": (cyclic(1), 1),
@@ -96,7 +95,7 @@ def test_eight_agents_are_sampled_and_every_draw_is_an_order() -> None:
     assert rotation(90) not in group
 
 
-@pytest.mark.parametrize("plane", [special_orthogonal(), orthogonal()], ids=["so2", "o2"])
+@pytest.mark.parametrize("plane", [PlaneGroup(mirrors=False), PlaneGroup(mirrors=True)], ids=["so2", "o2"])
 def test_angles_are_drawn_uniformly(plane) -> None:
     generator = torch.Generator().manual_seed(1)
     draws = [plane.draw(generator) for _ in range(2000)]
@@ -109,16 +108,16 @@ def test_angles_are_drawn_uniformly(plane) -> None:
 
 
 def test_membership_of_continuous_groups() -> None:
-    assert rotation("12.34") in special_orthogonal()
-    assert mirror(0) not in special_orthogonal()
-    assert mirror(0) in orthogonal()
-    assert Element(permutation=(1, 0)) not in orthogonal()
-    both = direct_product(orthogonal(), agent_permutations(2))
+    assert rotation("12.34") in PlaneGroup(mirrors=False)
+    assert mirror(0) not in PlaneGroup(mirrors=False)
+    assert mirror(0) in PlaneGroup(mirrors=True)
+    assert Element(permutation=(1, 0)) not in PlaneGroup(mirrors=True)
+    both = direct_product(PlaneGroup(mirrors=True), agent_permutations(2))
     assert both.name == "o2*agents"
     assert mirror(10) @ Element(permutation=(1, 0)) in both
     assert all(w in both for w in both.generators())
     assert "rot90" not in both
-    with_items = direct_product(orthogonal(), agent_permutations(2), item_orders("marks", 3))
+    with_items = direct_product(PlaneGroup(mirrors=True), agent_permutations(2), item_orders("marks", 3))
     swap = Element(items=(("marks", (1, 0, 2)),))
     assert mirror(10) @ Element(permutation=(1, 0)) @ swap in with_items
     assert swap not in both

@@ -18,7 +18,7 @@ from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.app import app, build_command
 from esp_cli.commands import COMMANDS, train
 from esp_cli.networks.build import NETWORKS
-from esp_cli.prior import PriorConfig
+from esp_cli.prior.config import PriorConfig
 from esp_cli.training.config import EvaluationConfig
 from esp_envs.registry import task_class, task_names
 from tests.bodies.models import biped

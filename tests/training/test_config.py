@@ -13,7 +13,7 @@ from esp_cli.files.documents import validate
 from esp_cli.networks.constrained import EquivariantConfig
 from esp_cli.networks.message_passing import EmpnConfig, MpnConfig
 from esp_cli.networks.plain import GruConfig, MlpConfig
-from esp_cli.prior import PriorConfig
+from esp_cli.prior.config import PriorConfig
 from esp_cli.studies.plan import Cell
 from esp_cli.training import config as config_module
 from esp_cli.training.config import EvaluationConfig, RunConfig, completed, resolve_config
