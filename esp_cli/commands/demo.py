@@ -122,7 +122,7 @@ def _show(folder: StudyFolder) -> None:
     from esp_cli.training.build import build_environment
 
     material, out = collect_study(folder), folder.path
-    console.note(f"curves -> {study_figures.draw_curves(material, out / CURVES).png}")
+    console.note(f"curves -> {study_figures.draw_curves(material, out / CURVES)}")
     trained = [TrainedPolicy.read(folder.run_path(cell)) for cell in folder.study.cells]
     if build_environment(trained[0].config.of_one_seed(), 1, "film").has("scene"):
         request = Request(out / FILM, episodes=_FILM_EPISODES, size=_FILM_PIXELS)

@@ -15,15 +15,7 @@ from matplotlib.ticker import EngFormatter
 
 from esp_cli.policies.statistics import curve_band
 from esp_cli.reporting.collect import Material, RunCurve
-from esp_cli.reporting.figures import (
-    Picture,
-    Style,
-    appearance,
-    caption,
-    dots,
-    over_setting,
-    written_figure,
-)
+from esp_cli.reporting.figures import Style, appearance, caption, dots, over_setting, written_figure
 from esp_cli.reporting.results import CellResult, Results, floats
 from esp_cli.studies.kinds import UNBROKEN, kind_of
 
@@ -62,7 +54,7 @@ def series_of(results: Results) -> list[Series]:
     return [Series(name, setting, cells) for (name, setting), cells in whole.items()]
 
 
-def draw_curves(material: Material, path: Path, style: Style = "screen") -> Picture:
+def draw_curves(material: Material, path: Path, style: Style = "screen") -> Path:
     """Draw the learning curves by panel, with the anchors of a run that has its final evaluation."""
     entries = {entry.name: entry for entry in material.results.cells}
     panels: dict[tuple[int, ...], Panel] = {}
@@ -82,7 +74,7 @@ def draw_curves(material: Material, path: Path, style: Style = "screen") -> Pict
     return learning_curves([*panels.values()], path, f"{material.results.mode} return{convention}", style)
 
 
-def draw_variants(results: Results, out: Path, style: Style = "screen") -> list[Picture]:
+def draw_variants(results: Results, out: Path, style: Style = "screen") -> list[Path]:
     """Draw the returns of a study of variants into a folder, over what it varies where that has an order."""
     if results.rows == "panels":
         return []
@@ -97,7 +89,7 @@ def draw_variants(results: Results, out: Path, style: Style = "screen") -> list[
     return pictures
 
 
-def draw_over_setting(results: Results, path: Path, style: Style = "screen") -> list[Picture]:
+def draw_over_setting(results: Results, path: Path, style: Style = "screen") -> list[Path]:
     """Draw returns over the weight of the consistency loss, or over strengths of breaking: `path`-1, `path`-2."""
     label, mode = f"{results.mode} return", results.mode
     if results.kind == "ablate-coefficient":
@@ -133,13 +125,13 @@ class Panel:
 
 def learning_curves(
     panels: Sequence[Panel], path: str | os.PathLike[str], ylabel: str, style: Style = "screen"
-) -> Picture:
+) -> Path:
     """Draw means over seeds with their 95 % bootstrap intervals, in panels with one legend, as in figure 4."""
     labels = list(dict.fromkeys(curve.label for panel in panels for curve in panel.curves))
     columns = min(len(panels), _MAX_COLUMNS)
     rows = math.ceil(len(panels) / columns)
     width, height = _ONE_PANEL if len(panels) == 1 else _PANEL
-    with written_figure(path, (max(columns * width, 6.0), rows * height + _LEGEND_INCHES), style) as (figure, picture):
+    with written_figure(path, (max(columns * width, 6.0), rows * height + _LEGEND_INCHES), style) as (figure, png):
         grid = figure.subplots(rows, columns, squeeze=False)
         for axes, panel in zip(grid.flat, panels, strict=False):
             for curve in panel.curves:
@@ -161,7 +153,7 @@ def learning_curves(
             ncols=min(len(labels), 2 * columns),
             title=caption(counts),
         )
-    return picture
+    return png
 
 
 def _finished(results: Results) -> dict[str, dict[str, CellResult]]:
