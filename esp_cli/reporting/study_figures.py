@@ -56,22 +56,20 @@ def series_of(results: Results) -> list[Series]:
 
 def draw_curves(material: Material, path: Path, style: Style = "screen") -> Path:
     """Draw the learning curves by panel, with the anchors of a run that has its final evaluation."""
-    entries = {entry.name: entry for entry in material.results.cells}
-    panels: dict[tuple[int, ...], Panel] = {}
-    for name in material.study.panels:
-        cells = [cell for cell in material.study.cells if cell.panel == name and cell.name in material.curves]
+    results, panels = material.results, dict[tuple[int, ...], Panel]()
+    for name in dict.fromkeys(cell.panel for cell in results.cells):
+        cells = [cell for cell in results.cells if cell.panel == name and cell.name in material.curves]
         drawn = [material.curves[cell.name] for cell in cells]
-        anchors: dict[str, float] = next((dict(a) for cell in cells if (a := entries[cell.name].anchors)), {})
-        if kind_of(material.study.kind).network_cost:
-            own = (entries[cell.name] for cell in cells)
-            anchors |= {f"paper {entry.variant}": entry.paper[0] for entry in own if entry.paper}
+        anchors: dict[str, float] = next((dict(cell.anchors) for cell in cells if cell.anchors), {})
+        if kind_of(results.kind).network_cost:
+            anchors |= {f"paper {cell.variant}": cell.paper[0] for cell in cells if cell.paper}
         if drawn:
-            title = cells[0].config.task if entries[cells[0].name].at is not None else name
+            title = name if cells[0].at is None else drawn[0].config.task
             title = title.rpartition(":")[2]  # of a task of the caller, the class
             panels.setdefault(tuple(map(id, drawn)), Panel(title, drawn, anchors))
-    conventions = {entry.convention for entry in entries.values() if entry.convention}
+    conventions = {cell.convention for cell in results.cells if cell.convention}
     convention = f" ({conventions.pop()})" if len(conventions) == 1 and len(panels) == 1 else ""
-    return learning_curves([*panels.values()], path, f"{material.results.mode} return{convention}", style)
+    return learning_curves([*panels.values()], path, f"{results.mode} return{convention}", style)
 
 
 def draw_variants(results: Results, out: Path, style: Style = "screen") -> list[Path]:
