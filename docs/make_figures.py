@@ -129,7 +129,7 @@ def draw_results() -> None:
             anchors = {key: round(value, 1) for key, value in cells[0].anchors.items()}
             learner = cells[0].name.split("-")[1]
             drawn = dots(groups, MEASURED / f"{picture}-{learner}", panel, f"{results.mode} return", anchors)
-            drawn.svg.unlink()  # the pages show PNGs
+            drawn.with_suffix(".svg").unlink()  # the pages show PNGs
     for picture, names in TUNED.items():
         searches, task = [read_results(MEASURED / f"{name}.json") for name in names], picture.removeprefix("tuned-")
         groups = {
@@ -141,11 +141,11 @@ def draw_results() -> None:
             if cell.panel.startswith(task)
         }
         title = f"{task.capitalize()}, tuned settings"
-        dots(groups, MEASURED / picture, title, f"{searches[0].mode} return").svg.unlink()
+        dots(groups, MEASURED / picture, title, f"{searches[0].mode} return").with_suffix(".svg").unlink()
     for picture, parts in {"ablate-coefficient": ("",), **BREAKING}.items():
         whole = join([read_results(MEASURED / f"{picture}{part}.json") for part in parts])
         for drawn in draw_over_setting(whole, MEASURED / picture):
-            drawn.svg.unlink()
+            drawn.with_suffix(".svg").unlink()
 
 
 def draw_steps() -> None:

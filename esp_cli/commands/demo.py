@@ -81,8 +81,13 @@ class LiveCurves(StudyProgress):
         self._folder, self._told = folder, 0
 
     def update(self, scheduler: Scheduler) -> None:
+        from esp_cli.reporting.collect import begun_curve
+
         super().update(scheduler)
-        curves = {cell.variant: _curve(self._folder.run_path(cell)) for cell in self._folder.study.cells}
+        curves: dict[str, list[tuple[int, float]]] = {}
+        for cell in self._folder.study.cells:
+            read = begun_curve(self._folder.run_path(cell), cell, "greedy")
+            curves[cell.variant] = list(zip(read.steps, read.values.mean(1), strict=True)) if read else []
         if self._live is not None:
             self._live.above = draw_curves(curves, self._folder.study.cells[0].config.steps, console.err.width)
             return
@@ -91,18 +96,6 @@ class LiveCurves(StudyProgress):
             returns = (f"{label} {value:.1f}" for label, (_, value) in zip(curves, points, strict=True))
             console.note(f"after {console.format_count(points[0][0])} steps: return {', '.join(returns)}")
         self._told = len(both)
-
-
-def _curve(run: Path) -> list[tuple[int, float]]:
-    """Return the steps of a run's evaluations, and the mean of their greedy returns over the seeds."""
-    from esp_cli.training.folder_names import METRICS
-    from esp_cli.training.metrics import column, read_metrics
-
-    rows = read_metrics(run / METRICS) if (run / METRICS).exists() else []
-    if not any("eval/return_greedy" in row for row in rows):  # before the first
-        return []
-    steps, returns = column(rows, "eval/return_greedy")
-    return list(zip(steps.tolist(), returns.mean(1).tolist(), strict=True))
 
 
 def _show(folder: StudyFolder) -> None:
@@ -114,7 +107,7 @@ def _show(folder: StudyFolder) -> None:
     from esp_cli.training.build import build_environment
 
     material, out = collect_study(folder), folder.path
-    console.note(f"curves -> {study_figures.draw_curves(material, out / CURVES).png}")
+    console.note(f"curves -> {study_figures.draw_curves(material, out / CURVES)}")
     trained = [TrainedPolicy.read(folder.run_path(cell)) for cell in folder.study.cells]
     if build_environment(trained[0].config.of_one_seed(), 1, "film").has("scene"):
         request = Request(out / FILM, episodes=_FILM_EPISODES, size=_FILM_PIXELS)

@@ -93,9 +93,9 @@ def report(
     if plot is not None:
         from esp_cli.reporting.study_figures import draw_curves
 
-        picture = draw_curves(material, plot, style)
-        for file in (picture.png, picture.svg, *([picture.svg.with_suffix(".pdf")] if style == "paper" else [])):
-            console.note(f"curves -> {file}")
+        png = draw_curves(material, plot, style)
+        for ending in (".png", ".svg", *([".pdf"] if style == "paper" else [])):
+            console.note(f"curves -> {png.with_suffix(ending)}")
     console.result(json, material.results.document(statistics=True), lambda: print_answer(material, full, limits))
     if not full and json != "-":
         console.note("every table: add --full")

@@ -95,8 +95,7 @@ def run_status(run: Run) -> str:
 
 def whole_status(scheduler: Scheduler) -> str:
     """Return how many runs are done, and the time left of the whole study, in one line."""
-    seconds, failed = scheduler.left_s(), scheduler.count("failed")
-    left = "?" if seconds is None else console.format_duration(seconds)
+    failed = scheduler.count("failed")
     parts = [f"{share(scheduler):.0%}", f"{scheduler.count('finished')}/{len(scheduler.runs)} runs finished"]
     parts += [f"{failed} failed"] if failed else []
-    return "  ".join([*parts, f"{left} left"])
+    return "  ".join([*parts, f"{console.format_duration(scheduler.left_s())} left"])

@@ -16,7 +16,7 @@ from esp_cli.defaults import Mode
 from esp_cli.files.documents import flat
 from esp_cli.files.formatting import format_exactly
 from esp_cli.policies.evaluation import FinalEvaluation
-from esp_cli.policies.statistics import area_under_curve, steps_to_threshold, summarise
+from esp_cli.policies.statistics import Passing, area_under_curve, steps_to_threshold, summarise
 from esp_cli.reporting.results import CellResult, Results, returns_of, summarised
 from esp_cli.studies.kinds import kind_of
 from esp_cli.studies.paper import reported
@@ -25,7 +25,7 @@ from esp_cli.studies.study import StudyFolder, read_evaluation
 from esp_cli.training.build import spec_of
 from esp_cli.training.config import RunConfig
 from esp_cli.training.folder_names import METRICS
-from esp_cli.training.metrics import column, elapsed_s, read_metrics
+from esp_cli.training.metrics import column, elapsed_s, read_last_row, read_metrics
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.settings import parse_config
 from esp_envs.errors import UserError
@@ -73,6 +73,13 @@ def read_curve(path: Path, label: str | None, mode: Mode) -> RunCurve:
     rows = read_metrics(folder.metrics_path)
     curve = _curve(rows, mode, path, label or name, parse_config(folder.config, path))
     return replace(curve, task_version=folder.task_version())
+
+
+def begun_curve(run: Path, cell: Cell, mode: Mode) -> RunCurve | None:
+    """Read the evaluations of a run of a study; None where there is none yet."""
+    rows = read_metrics(run / METRICS) if (run / METRICS).exists() else []
+    begun = any(f"eval/return_{mode}" in row for row in rows)
+    return _curve(rows, mode, run, cell.variant, cell.config) if begun else None
 
 
 def _curve(rows: Sequence[Mapping[str, Any]], mode: Mode, run: Path, label: str, config: RunConfig) -> RunCurve:
@@ -212,14 +219,12 @@ def _refuse_unlike(curves: Sequence[RunCurve]) -> None:
 
 def _state(folder: StudyFolder, cell: Cell, mode: Mode) -> _State:
     run, final = folder.run_path(cell), None
-    rows = read_metrics(run / METRICS) if (run / METRICS).exists() else []
     if folder.is_trained(cell) and (final := read_evaluation(run)) is not None:
         wanted = len(cell.config.seeds)
         if any(len(returns.per_seed) != wanted for returns in (final.greedy, final.stochastic)):
             raise UserError(f"{run} does not fit its study: its final evaluation has not the {wanted} seeds of the run")
-    begun = any(f"eval/return_{mode}" in row for row in rows)
-    curve = _curve(rows, mode, run, cell.variant, cell.config) if begun else None
-    return _State(rows[-1]["step"] if rows else 0, curve, final)
+    step = read_last_row(run / METRICS).get("step", 0)
+    return _State(step, begun_curve(run, cell, mode), final)
 
 
 def _results(study: Study, states: Mapping[str, _State], mode: Mode, thresholds: Sequence[float]) -> Results:
@@ -227,10 +232,13 @@ def _results(study: Study, states: Mapping[str, _State], mode: Mode, thresholds:
     first = next(iter(configs.values()))
     shared = {key: value for key, value in first.items() if all(c.get(key, ...) == value for c in configs.values())}
     own = {name: {key: config[key] for key in config if key not in shared} for name, config in configs.items()}
-    cells = tuple(_cell(study, cell, states[cell.name], mode, own[cell.name]) for cell in study.cells)
-    results = Results(**study.model_dump(exclude={"cells"}), mode=mode, config=shared, cells=cells)
-    timed = tuple(_timed(results, cell, states[cell.name].curve, thresholds) for cell in cells)
-    return summarised(results.model_copy(update={"cells": timed}))
+    cells = [_cell(study, cell, states[cell.name], mode, own[cell.name]) for cell in study.cells]
+    ended = {cell.name: summarise(found).mean for cell in cells if (found := returns_of(cell, mode)) is not None}
+    for k, cell in enumerate(cells):
+        last = ended.get(cell.reference or "", ended.get(cell.name)) if cell.name in ended else None
+        limits = thresholds or ([] if last is None else [last])
+        cells[k] = cell.model_copy(update={"steps_to": _passings(states[cell.name].curve, limits)})
+    return summarised(Results(**study.model_dump(exclude={"cells"}), mode=mode, config=shared, cells=tuple(cells)))
 
 
 def _cell(study: Study, cell: Cell, state: _State, mode: Mode, config: Mapping[str, Any]) -> CellResult:
@@ -270,19 +278,13 @@ def _cell(study: Study, cell: Cell, state: _State, mode: Mode, config: Mapping[s
     return CellResult(**fields)
 
 
-def _timed(results: Results, cell: CellResult, curve: RunCurve | None, thresholds: Sequence[float]) -> CellResult:
-    """Return a cell with the first steps at thresholds, by default at what its reference ended with."""
-    if curve is None or (not thresholds and cell.status != "finished"):
-        return cell
-    if not thresholds:
-        other = results.reference_of(cell)
-        values = returns_of(cell if other is None or not other.returns else other, results.mode)
-        mean = None if values is None else summarise(values).mean
-        thresholds = [] if mean is None else [mean]
+def _passings(curve: RunCurve | None, thresholds: Sequence[float]) -> tuple[Passing, ...]:
+    """Return the first steps of a curve at thresholds."""
+    if curve is None:
+        return ()
     rounded = np.round(curve.values, _DIGITS)  # as the returns are, from which thresholds are taken
     passings = [steps_to_threshold(curve.steps, rounded, limit) for limit in thresholds]
-    stated = tuple(replace(passing, threshold=round(passing.threshold, _DIGITS)) for passing in passings)
-    return cell.model_copy(update={"steps_to": stated})
+    return tuple(replace(passing, threshold=round(passing.threshold, _DIGITS)) for passing in passings)
 
 
 def _rounded(values: Iterable[float | None]) -> tuple[float | None, ...]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -48,16 +47,6 @@ _ONE_COLUMN, _LEAST_SHARE = 7.5, 0.6
 """Width up to which a figure takes one column in print, inches, and the least share of its height that it keeps."""
 _JITTER = 0.08  # horizontal distance of the lines of `over_setting`, so that intervals do not lie upon each other
 _WIDEST = 0.4  # all lines together, at one value
-POINTS_PER_INCH = 72  # of an SVG by matplotlib
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A figure that was written."""
-
-    png: Path  # its file as PNG
-    svg: Path  # its file as SVG
-    size: tuple[float, float]  # width and height of the SVG, points
 
 
 def dots(
@@ -67,13 +56,13 @@ def dots(
     xlabel: str,
     anchors: Mapping[str, float] | None = None,
     style: Style = "screen",
-) -> Picture:
+) -> Path:
     """Draw the mean of each group [S] as a dot with its interval, and every seed as a small one, from top to bottom.
 
     The axis shows the groups and no zero: returns have none, and a bar that begins there would say otherwise. Anchors
     are lines where they are in view; the legend names the others. For path and style see `written_figure`.
     """
-    with written_figure(path, (7.2, 2.1 + 0.5 * len(groups)), style) as (figure, picture):
+    with written_figure(path, (7.2, 2.1 + 0.5 * len(groups)), style) as (figure, png):
         axes = _titled(figure, title)
         for index, group in enumerate(groups.values()):
             colour, values = COLORS[index % len(COLORS)], np.asarray(group, dtype=np.float64)
@@ -102,7 +91,7 @@ def dots(
         axes.set_xlabel("\n".join(filter(None, (xlabel, caption(counts)))))
         if anchors:
             figure.legend(loc="outside lower center", ncols=2)
-    return picture
+    return png
 
 
 def over_setting(
@@ -113,7 +102,7 @@ def over_setting(
     order: Iterable[str] = (),
     paper: Mapping[str, Mapping[str, float]] | None = None,
     style: Style = "screen",
-) -> Picture:
+) -> Path:
     """Draw returns over a setting as lines with intervals, and the paper's means as crosses.
 
     A line has by value of the setting one number per seed [S], the paper one mean. Values stand in `order` at equal
@@ -122,7 +111,7 @@ def over_setting(
     known = dict.fromkeys(value for line in lines.values() for value in line)
     places = {value: k for k, value in enumerate(v for v in dict.fromkeys([*order, *known]) if v in known)}
     apart = min(_JITTER, _WIDEST / len(lines))
-    with written_figure(path, (6.4, 4.4), style) as (figure, picture):
+    with written_figure(path, (6.4, 4.4), style) as (figure, png):
         axes = _titled(figure, title)
         for index, (name, line) in enumerate(lines.items()):
             colour, dashes = appearance(index)
@@ -140,7 +129,7 @@ def over_setting(
         axes.set_xlabel("\n".join(filter(None, (labels[0], caption(counts)))))
         axes.set_ylabel(labels[1])
         figure.legend(loc="outside lower center", ncols=2)
-    return picture
+    return png
 
 
 def appearance(index: int) -> tuple[str, LineStyle]:
@@ -152,24 +141,24 @@ def appearance(index: int) -> tuple[str, LineStyle]:
 @contextmanager
 def written_figure(
     path: str | os.PathLike[str], size: tuple[float, float], style: Style = "screen"
-) -> Iterator[tuple[Figure, Picture]]:
-    """Set up a figure of a size in inches and write it at the end, as PNG and as SVG.
+) -> Iterator[tuple[Figure, Path]]:
+    """Set up a figure of a size in inches and write it at the end, as PNG, whose path comes with it, and as SVG.
 
     ``.png`` and ``.svg`` are appended to the path, or take the place of either. For print it is a column or a page wide
     instead, with small letters, and a PDF too.
     """
     path = Path(path)
     stem = path.stem if path.suffix in {".png", ".svg", ".pdf"} else path.name
-    png, svg = path.with_name(f"{stem}.png"), path.with_name(f"{stem}.svg")
+    png = path.with_name(f"{stem}.png")
     for_print = style == "paper"
     if for_print:
         share = (PAGE if size[0] > _ONE_COLUMN else COLUMN) / size[0]
         size = (size[0] * share, size[1] * max(share, _LEAST_SHARE))
     with mpl.rc_context({**_STYLE, **(PAPER | {"savefig.dpi": PAPER_DPI} if for_print else {})}):
         figure = Figure(figsize=size, layout="constrained")
-        yield figure, Picture(png, svg, (size[0] * POINTS_PER_INCH, size[1] * POINTS_PER_INCH))
-        for file in (png, svg, *([png.with_suffix(".pdf")] if for_print else [])):
-            content = saved(figure, file.suffix[1:])
+        yield figure, png
+        for kind in ("png", "svg", *(["pdf"] if for_print else [])):
+            content, file = saved(figure, kind), png.with_suffix(f".{kind}")
             with attempting("write the figure", file):
                 write_file(file, content)
 

@@ -43,8 +43,8 @@ class LivePage:
         curve = read_curve(trainer.folder.path, None, "greedy")
         with TemporaryDirectory() as scratch:
             ylabel = f"greedy return ({spec.convention})"
-            picture = learning_curves([Panel(spec.name, [curve])], Path(scratch) / "curve", ylabel)
-            svg = picture.svg.read_bytes()
+            png = learning_curves([Panel(spec.name, [curve])], Path(scratch) / "curve", ylabel)
+            svg = png.with_suffix(".svg").read_bytes()
         if trainer.evaluation_worlds.has("scene"):
             trained = TrainedPolicy(config, trainer.learner.policy, spec, step, trainer.folder.path)
             film = draw_film(trained, _FILM_PIXELS, episodes=1)

@@ -48,9 +48,9 @@ def write_report(material: Material, out: Path, style: Style = "screen") -> list
         raise UserError("no run of this study has an evaluation yet; run it first, or wait a little")
     # Names in this folder are the program's own: links there are replaced, where drawing would follow them.
     with TemporaryDirectory() as scratch:
-        curves = draw_curves(material, Path(scratch) / CURVES, style=style)
-        pictures = [curves, *draw_variants(material.results, Path(scratch), style)]
-        images = [(picture.png.stem, data_uri(picture.svg.read_bytes(), "image/svg+xml")) for picture in pictures]
+        pictures = [draw_curves(material, Path(scratch) / CURVES, style)]
+        pictures += draw_variants(material.results, Path(scratch), style)
+        images = [(png.stem, data_uri(png.with_suffix(".svg").read_bytes(), "image/svg+xml")) for png in pictures]
         drawn = sorted(Path(scratch).iterdir())
         _refuse_foreign(out, [MARKDOWN, RESULTS, PAGE, *(file.name for file in drawn)])
         out.mkdir(parents=True, exist_ok=True)
@@ -69,16 +69,13 @@ def write_report(material: Material, out: Path, style: Style = "screen") -> list
         "command": study.command,
         "answer": answer(material),
         "tables": tables,
-        "size": curves.size,
-        "curves": images[0][1],
-        "pictures": images[1:],
+        "images": images,
         "films": films,
         "runs": runs,
     }
-    names = [picture.png.stem for picture in pictures]
     markdown = [f"# {markdown_text(study.title)}", _fenced(study.command)]
     markdown += [f"## {markdown_text(table.title)}\n\n{table.markdown()}" for table in tables]
-    markdown += [f"![{name}]({name}.png)" for name in names]
+    markdown += [f"![{png.stem}]({png.name})" for png in pictures]
     markdown += ["## Each run by itself", _fenced("\n".join(run["command"] for run in runs))]
     files = {
         PAGE: escaped(template("report.html").render(content)).encode(),
@@ -87,7 +84,7 @@ def write_report(material: Material, out: Path, style: Style = "screen") -> list
     }
     for name, text in files.items():
         replace_file(out / name, text)
-    return [out / name for name in (PAGE, MARKDOWN, *(f"{stem}.png" for stem in names), RESULTS)]
+    return [out / name for name in (PAGE, MARKDOWN, *(png.name for png in pictures), RESULTS)]
 
 
 def draw_films(runs: Mapping[str, Path], watch: Callable[[int], None]) -> None:

@@ -15,15 +15,7 @@ from matplotlib.ticker import EngFormatter
 
 from esp_cli.policies.statistics import curve_band
 from esp_cli.reporting.collect import Material, RunCurve
-from esp_cli.reporting.figures import (
-    Picture,
-    Style,
-    appearance,
-    caption,
-    dots,
-    over_setting,
-    written_figure,
-)
+from esp_cli.reporting.figures import Style, appearance, caption, dots, over_setting, written_figure
 from esp_cli.reporting.results import CellResult, Results, floats
 from esp_cli.studies.kinds import UNBROKEN, kind_of
 
@@ -62,27 +54,25 @@ def series_of(results: Results) -> list[Series]:
     return [Series(name, setting, cells) for (name, setting), cells in whole.items()]
 
 
-def draw_curves(material: Material, path: Path, style: Style = "screen") -> Picture:
+def draw_curves(material: Material, path: Path, style: Style = "screen") -> Path:
     """Draw the learning curves by panel, with the anchors of a run that has its final evaluation."""
-    entries = {entry.name: entry for entry in material.results.cells}
-    panels: dict[tuple[int, ...], Panel] = {}
-    for name in material.study.panels:
-        cells = [cell for cell in material.study.cells if cell.panel == name and cell.name in material.curves]
+    results, panels = material.results, dict[tuple[int, ...], Panel]()
+    for name in dict.fromkeys(cell.panel for cell in results.cells):
+        cells = [cell for cell in results.cells if cell.panel == name and cell.name in material.curves]
         drawn = [material.curves[cell.name] for cell in cells]
-        anchors: dict[str, float] = next((dict(a) for cell in cells if (a := entries[cell.name].anchors)), {})
-        if kind_of(material.study.kind).network_cost:
-            own = (entries[cell.name] for cell in cells)
-            anchors |= {f"paper {entry.variant}": entry.paper[0] for entry in own if entry.paper}
+        anchors: dict[str, float] = next((dict(cell.anchors) for cell in cells if cell.anchors), {})
+        if kind_of(results.kind).network_cost:
+            anchors |= {f"paper {cell.variant}": cell.paper[0] for cell in cells if cell.paper}
         if drawn:
-            title = cells[0].config.task if entries[cells[0].name].at is not None else name
+            title = name if cells[0].at is None else drawn[0].config.task
             title = title.rpartition(":")[2]  # of a task of the caller, the class
             panels.setdefault(tuple(map(id, drawn)), Panel(title, drawn, anchors))
-    conventions = {entry.convention for entry in entries.values() if entry.convention}
+    conventions = {cell.convention for cell in results.cells if cell.convention}
     convention = f" ({conventions.pop()})" if len(conventions) == 1 and len(panels) == 1 else ""
-    return learning_curves([*panels.values()], path, f"{material.results.mode} return{convention}", style)
+    return learning_curves([*panels.values()], path, f"{results.mode} return{convention}", style)
 
 
-def draw_variants(results: Results, out: Path, style: Style = "screen") -> list[Picture]:
+def draw_variants(results: Results, out: Path, style: Style = "screen") -> list[Path]:
     """Draw the returns of a study of variants into a folder, over what it varies where that has an order."""
     if results.rows == "panels":
         return []
@@ -97,7 +87,7 @@ def draw_variants(results: Results, out: Path, style: Style = "screen") -> list[
     return pictures
 
 
-def draw_over_setting(results: Results, path: Path, style: Style = "screen") -> list[Picture]:
+def draw_over_setting(results: Results, path: Path, style: Style = "screen") -> list[Path]:
     """Draw returns over the weight of the consistency loss, or over strengths of breaking: `path`-1, `path`-2."""
     label, mode = f"{results.mode} return", results.mode
     if results.kind == "ablate-coefficient":
@@ -133,13 +123,13 @@ class Panel:
 
 def learning_curves(
     panels: Sequence[Panel], path: str | os.PathLike[str], ylabel: str, style: Style = "screen"
-) -> Picture:
+) -> Path:
     """Draw means over seeds with their 95 % bootstrap intervals, in panels with one legend, as in figure 4."""
     labels = list(dict.fromkeys(curve.label for panel in panels for curve in panel.curves))
     columns = min(len(panels), _MAX_COLUMNS)
     rows = math.ceil(len(panels) / columns)
     width, height = _ONE_PANEL if len(panels) == 1 else _PANEL
-    with written_figure(path, (max(columns * width, 6.0), rows * height + _LEGEND_INCHES), style) as (figure, picture):
+    with written_figure(path, (max(columns * width, 6.0), rows * height + _LEGEND_INCHES), style) as (figure, png):
         grid = figure.subplots(rows, columns, squeeze=False)
         for axes, panel in zip(grid.flat, panels, strict=False):
             for curve in panel.curves:
@@ -161,7 +151,7 @@ def learning_curves(
             ncols=min(len(labels), 2 * columns),
             title=caption(counts),
         )
-    return picture
+    return png
 
 
 def _finished(results: Results) -> dict[str, dict[str, CellResult]]:

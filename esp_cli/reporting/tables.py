@@ -58,11 +58,10 @@ def all_tables(results: Results) -> list[Table]:
 
 def returns_table(results: Results) -> Table:
     """Return the study in its own layout, ours above the paper's."""
-    cells = {(cell.panel, cell.variant): cell for cell in results.cells}
-    most = max(len(cell.seeds) for cell in results.cells)
-    panels, variants = (list(dict.fromkeys(names)) for names in zip(*cells, strict=True))
     by_panel = results.rows == "panels"
-    rows, columns = (panels, variants) if by_panel else (variants, panels)
+    cells = {(c.panel, c.variant) if by_panel else (c.variant, c.panel): c for c in results.cells}
+    rows, columns = (list(dict.fromkeys(names)) for names in zip(*cells, strict=True))
+    most = max(len(cell.seeds) for cell in results.cells)
     has_paper = any(cell.paper for cell in results.cells)
     lines: list[tuple[str, ...]] = []
 
@@ -71,7 +70,7 @@ def returns_table(results: Results) -> Table:
         return return_text(cell) + (f" (n = {len(cell.seeds)})" if fewer else "")
 
     for row in rows:
-        placed = [cells.get((row, column) if by_panel else (column, row)) for column in columns]
+        placed = [cells.get((row, column)) for column in columns]
         ours = [NOTHING if cell is None else own_text(cell) for cell in placed]
         theirs = [format_mean(*cell.paper) if cell is not None and cell.paper else NOTHING for cell in placed]
         lines.append((row, *(["ours"] if has_paper else []), *ours))

@@ -5,25 +5,21 @@ from __future__ import annotations
 import json
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 NUM_SEEDS = 10  # seeds behind every number of the paper
 _FILE = Path(__file__).with_name("paper.json")
 
 
-class Reported(NamedTuple):
-    """A number of the paper."""
+def reported(key: tuple[str, ...] | None) -> tuple[float, float | None] | None:
+    """Return a number of the paper by its place, as ("table1", "navigation", "500000", "mappo", "esp"); or None.
 
-    mean: float  # episode reward, mean over ten seeds
-    sem: float | None  # standard error of the mean; None where it was read off a figure
-
-
-def reported(key: tuple[str, ...] | None) -> Reported | None:
-    """Return a number of the paper by its place, as ("table1", "navigation", "500000", "mappo", "esp"); or None."""
+    It is the mean episode reward over ten seeds and its standard error, None where it was read off a figure.
+    """
     place: Any = _content()
     for part in key or ():
         place = place.get(part) if isinstance(place, dict) else None
-    return Reported(*place) if isinstance(place, list) else None
+    return (place[0], place[1]) if isinstance(place, list) else None
 
 
 def horizons(task: str) -> tuple[int, ...]:

@@ -35,9 +35,5 @@ class Study(Strict):
     cells: tuple[Cell, ...]  # in the order in which they are run and shown
     left_out: dict[str, str] = Field({})  # by "TASK: METHOD" why there is no such cell
 
-    @property
-    def panels(self) -> list[str]:
-        return list(dict.fromkeys(cell.panel for cell in self.cells))
-
 
 STUDY_FORMAT = DocumentFormat("esp-study", 1, "a study")

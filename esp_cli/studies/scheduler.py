@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -11,6 +12,7 @@ from esp_cli.files.formatting import sentence
 from esp_cli.studies.engine import Engine, Job
 from esp_cli.studies.plan import Cell
 from esp_cli.studies.study import StudyFolder
+from esp_cli.training.folder_names import LOG
 from esp_envs.errors import UserError
 
 Status = Literal["waiting", "training", "evaluating", "elsewhere", "finished", "failed", "stopped"]
@@ -28,13 +30,6 @@ class Run:
     trained_s: float = 0.0  # seconds of training behind these steps, summed over interruptions
     message: str = ""  # why it failed
     job: Job | None = field(default=None, repr=False)  # its process, if this scheduler started it
-    asked: bool = field(default=False, repr=False)  # whether the process was asked to stop
-
-    def ask_to_stop(self) -> None:
-        """Ask its process, once, to end after its iteration: a second request would interrupt it."""
-        if self.job is not None and not self.asked:
-            self.asked = True
-            self.job.ask_to_stop()
 
     @property
     def is_active(self) -> bool:
@@ -84,24 +79,21 @@ class Scheduler:
                 if run.job is not None:
                     run.job.kill()
 
-    def left_s(self) -> float | None:
-        """Return the seconds until the last run ends, from what the runs so far took; None where that does not tell."""
-        costs = [(run, self._seconds_left(run)) for run in self.runs if run.is_active or run.status == "waiting"]
-        if any(seconds is None for _, seconds in costs):
-            return None
-        running = [seconds or 0.0 for run, seconds in costs if run.is_active]
-        return makespan(running, [seconds or 0.0 for run, seconds in costs if not run.is_active], self.jobs)
+    def left_s(self) -> float:
+        """Return the seconds until the last run ends, from what the runs so far took; infinite where nothing tells."""
+        running = [self._seconds_left(run) for run in self.runs if run.is_active]
+        return makespan(running, [self._seconds_left(run) for run in self.runs if run.status == "waiting"], self.jobs)
 
-    def _seconds_left(self, run: Run) -> float | None:
+    def _seconds_left(self, run: Run) -> float:
         """Estimate what is left of a run by its own speed, or by that of runs like it."""
         steps = max(0, run.cell.config.steps - run.step)
         if run.status == "evaluating":
-            return None  # its final evaluation takes what no training tells
+            return math.inf  # its final evaluation takes what no training tells
         if run.step and run.trained_s:
             return steps * run.trained_s / run.step
         known = [other for other in self.runs if other.step and other.trained_s]
         alike = [other for other in known if _kind(other) == _kind(run)] or known
-        return steps * sum(other.trained_s / other.step for other in alike) / len(alike) if alike else None
+        return steps * sum(other.trained_s / other.step for other in alike) / len(alike) if alike else math.inf
 
     def _fill(self) -> None:
         for run in self.runs:
@@ -121,11 +113,9 @@ class Scheduler:
                 return
             arguments = self.folder.next_command(run.cell)
             run.status = "training" if arguments[0] == "train" else "evaluating"
-            run.job, run.asked = self.engine.start(arguments, self.folder.log_path(run.cell)), False
-        except OSError as error:
-            run.status, run.message = "failed", sentence(error)
-        except UserError as error:
-            run.status, run.message = "failed", str(error)
+            run.job = self.engine.start(arguments, self.folder.run_path(run.cell) / LOG)
+        except (OSError, UserError) as error:
+            run.status, run.message = "failed", sentence(error) if isinstance(error, OSError) else str(error)
 
     def _follow(self, run: Run, going: bool) -> None:
         """Look at a run: how far it is, and whether its process has ended."""
@@ -134,21 +124,18 @@ class Scheduler:
             if not self.folder.is_in_use(run.cell):
                 run.status = "waiting" if going else "stopped"
         elif (code := run.job.poll()) is not None:
-            self._ended(run, code, run.job.last_words(), going)
-
-    def _ended(self, run: Run, code: int, words: str, going: bool) -> None:
-        run.job, trained = None, run.status == "training" and self.folder.is_trained(run.cell)
-        if self.folder.is_finished(run.cell):
-            run.status = "finished"
-        elif going and code == 0 and trained:
-            self._start(run)
-        else:
-            run.status, run.message = ("failed", words) if going else ("stopped", "")
+            words, run.job = run.job.last_words(), None
+            if self.folder.is_finished(run.cell):
+                run.status = "finished"
+            elif going and code == 0 and run.status == "training" and self.folder.is_trained(run.cell):
+                self._start(run)
+            else:
+                run.status, run.message = ("failed", words) if going else ("stopped", "")
 
     def _stop(self) -> None:
         for run in self.runs:
             if run.job is not None:
-                run.ask_to_stop()
+                run.job.ask_to_stop()
             elif run.status in ("waiting", "elsewhere"):
                 run.status = "stopped"
 

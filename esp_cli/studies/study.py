@@ -165,10 +165,6 @@ class StudyFolder:
     def run_path(self, cell: Cell) -> Path:
         return self.path / RUNS / cell.name
 
-    def log_path(self, cell: Cell) -> Path:
-        """Return the file that the processes of a cell write to."""
-        return self.run_path(cell) / LOG
-
     def prepare(self, cell: Cell) -> RunFolder:
         """Make the run folder of a cell, or open the one that is there, unless that is damaged or another run."""
         path = self.run_path(cell)
@@ -192,10 +188,6 @@ class StudyFolder:
         """Return whether a cell's training is done; the policy file is the last that a run writes."""
         return (self.run_path(cell) / POLICY).is_file()
 
-    def evaluation_path(self, cell: Cell) -> Path:
-        """Return the file that the final evaluation of a cell's trained policy is written to."""
-        return self.run_path(cell) / FINAL
-
     def is_finished(self, cell: Cell) -> bool:
         return self.is_trained(cell) and read_evaluation(self.run_path(cell)) is not None
 
@@ -204,7 +196,7 @@ class StudyFolder:
         if not self.is_trained(cell):
             unseen = [] if self.check else ["--no-check"]
             return ["train", "--resume", str(self.run_path(cell)), *unseen, *cell.config.own_words()]
-        final = self.evaluation_path(cell)
+        final = self.run_path(cell) / FINAL
         final.unlink(missing_ok=True)  # a damaged one is made again, and a link there is not followed
         words = ["eval", str(self.run_path(cell)), "--episodes", str(self.study.episodes), "--json", str(final)]
         return words + cell.config.own_words()
@@ -240,11 +232,8 @@ class StudyFolder:
             for theirs in other.study.cells
             if theirs.config == cell.config and other.is_finished(theirs)
         )
-        for path in alike:
-            final = read_evaluation(path)
-            if final is not None and final.task_version == _task_version(cell.config):
-                return path
-        return None
+        finals = ((path, read_evaluation(path)) for path in alike)
+        return next((path for path, one in finals if one and one.task_version == _task_version(cell.config)), None)
 
     def adopt(self, cell: Cell, twin: Path) -> None:
         """Take a finished run over as this cell's, without links, which bring in files from anywhere; its log tells."""

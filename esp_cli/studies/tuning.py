@@ -98,7 +98,13 @@ class Tuning(Search):
                     "a setting of the learner, or leave this prior out"
                 )
             for name, dimension in space.items():
-                self._refuse_given(name)
+                if name.partition(".")[0] in _GIVEN:
+                    raise UserError(
+                        f"the space varies '{name}', and then trials are not scored alike; leave it out, and fix it by "
+                        f"--set {name}=VALUE"
+                    )
+                if name in self.overrides:
+                    raise UserError(f"--set {name} fixes what the space varies; leave it out, or use another --space")
                 for value in dimension.corners():
                     self._asked(prior, {name: value}, self.trial_seeds)
             idle.append(self._without_effect(prior))
@@ -109,16 +115,6 @@ class Tuning(Search):
             raise UserError(
                 f"the space varies '{lost[0]}', which is without effect beside the other settings; leave it out"
             )
-
-    def _refuse_given(self, name: str) -> None:
-        """Refuse a setting that is not the learner's, or that --set fixes."""
-        if name.partition(".")[0] in _GIVEN:
-            raise UserError(
-                f"the space varies '{name}', and then trials are not scored alike; leave it out, and fix it by "
-                f"--set {name}=VALUE"
-            )
-        if name in self.overrides:
-            raise UserError(f"--set {name} fixes what the space varies; leave it out, or use another --space")
 
     def _draws(self, budget: int) -> list[dict[str, object]]:
         """Return the default settings, and then those drawn that go together and are new."""

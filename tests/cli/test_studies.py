@@ -21,6 +21,7 @@ from esp_cli.studies.scheduler import Scheduler
 from esp_cli.studies.study import StudyFolder
 from esp_cli.studies.symmetry import METHODS
 from esp_cli.training import trainer
+from esp_cli.training.folder_names import FINAL
 from esp_cli.training.metrics import read_metrics
 from esp_envs.errors import UserError
 from esp_envs.installed import install
@@ -80,7 +81,9 @@ def test_a_study_runs_from_a_command_to_a_page_and_a_small_file(tmp_path: Path) 
     study = folder.study
     typed = map(str, ("esp", *TINY, "--steps", 100, *TINY_OPTIONS, "--out", out, "--jobs", 1))
     assert study.command == shlex.join(typed)
-    assert json.loads(folder.evaluation_path(study.cells[0]).read_text())["episodes"] == 4, "and not that of training"
+    assert json.loads((folder.run_path(study.cells[0]) / FINAL).read_text())["episodes"] == 4, (
+        "and not that of training"
+    )
     # the run is the one that training by itself gives
     alone = train_tiny(tmp_path / "alone", "--seeds", "2", "--prior", "none", steps=100)
     policy = "policy.safetensors"

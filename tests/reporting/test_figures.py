@@ -40,19 +40,19 @@ def drawn(monkeypatch):
 
 def draw(curves, path, **lines):
     picture = learning_curves([Panel("a panel", curves, **lines)], path, "return")
-    return picture.png, picture.svg
+    return picture, picture.with_suffix(".svg")
 
 
 def draw_curves(path, lines=None):
     panel = Panel("navigation", CURVES, lines or {"random": -200.4, "heuristic": -129.0, "paper": -130.22})
     picture = learning_curves([panel], path, "return, convention esp")
-    return picture.png, picture.svg
+    return picture, picture.with_suffix(".svg")
 
 
 def draw_dots(path, lines=None):
     anchors = {"random": -221.4, "heuristic": -119.0} if lines is None else lines
     picture = dots(GROUPS, path, "transforms", "return, convention esp", anchors)
-    return picture.png, picture.svg
+    return picture, picture.with_suffix(".svg")
 
 
 @pytest.mark.parametrize("draw", [draw_curves, draw_dots])
@@ -163,7 +163,7 @@ def test_what_cannot_be_drawn_is_one_sentence_and_no_file(tmp_path, draw, text):
 def test_panels_share_a_legend_and_each_has_its_title_and_anchors(tmp_path):
     panels = [Panel("navigation, 500k", [RISING, FLAT], {"random": 1.0, "far off": 99.0}), Panel("formation", [FLAT])]
     picture = learning_curves(panels, tmp_path / "curves.png", "greedy return")
-    text = picture.svg.read_text()
+    text = picture.with_suffix(".svg").read_text()
     assert all(part in text for part in ("navigation, 500k", "formation", "greedy return", "random"))
     assert "far off" not in text, "it would squeeze the curves"
     assert text.count("<!-- MAPPO-ESP -->") == 1
@@ -185,7 +185,7 @@ def test_names_of_anchors_that_lie_together_stand_in_a_row_and_what_is_below_ran
 def test_the_coefficient_is_drawn_with_the_papers_means(tmp_path):
     lines = {"500k": {"c = 0": [1.0, 2.0], "c = 0.5": [3.0, 4.0]}, "3M": {"c = 0": [5.0, 6.0]}}
     paper = {"500k": {"c = 0": 1.0}, "3M": {"gone": 2.0}}
-    text = over_setting(lines, tmp_path / "c", "title", ("weight", "return"), (), paper).svg.read_text()
+    text = over_setting(lines, tmp_path / "c", "title", ("weight", "return"), (), paper).with_suffix(".svg").read_text()
     assert all(f"<!-- {part} -->" in text for part in ("c = 0.5", "500k", "3M", "paper, 500k"))
     assert "paper, 3M" not in text
 
@@ -193,7 +193,7 @@ def test_the_coefficient_is_drawn_with_the_papers_means(tmp_path):
 def test_the_settings_values_stand_in_their_order_though_no_line_has_all(tmp_path):
     lines = {"a": {"c = 0": [1.0], "c = 1": [2.0]}, "b": {"c = 0": [1.0], "c = 0.5": [3.0]}}
     for order, expected in ((("c = 0", "c = 0.1", "c = 0.5", "c = 1"), [0, 2, 1]), ((), [0, 1, 2])):
-        text = over_setting(lines, tmp_path / "c", "t", ("x", "y"), order).svg.read_text()
+        text = over_setting(lines, tmp_path / "c", "t", ("x", "y"), order).with_suffix(".svg").read_text()
         places = [text.index(f"<!-- {name} -->") for name in ("c = 0", "c = 1", "c = 0.5")]
         assert [sorted(places).index(place) for place in places] == expected
         assert "c = 0.1" not in text

@@ -11,7 +11,7 @@ from esp_cli.reporting.collect import collect_study
 from esp_cli.reporting.results import read_results, summarise_cell, summarised
 from esp_cli.reporting.tables import TABLES, all_tables, returns_table
 from esp_cli.studies.study import StudyFolder
-from esp_cli.training.folder_names import POLICY
+from esp_cli.training.folder_names import FINAL, POLICY
 from tests.studies.small_studies import small_study, write_study
 
 PLAIN, ESP = [-150.0, -160.0, -140.0], [-130.0, -120.0, -140.0]
@@ -167,7 +167,7 @@ def test_a_stopped_seed_is_shown_and_nothing_is_compared_with_it(tmp_path):
 
 def test_what_is_unfinished_or_not_run_is_said(tmp_path):
     folder = write_study(tmp_path / "s", small_study(), {"MAPPO": PLAIN})
-    folder.evaluation_path(folder.study.cells[0]).unlink()
+    (folder.run_path(folder.study.cells[0]) / FINAL).unlink()
     found = collect_study(folder).results
     assert [cell.status for cell in found.cells] == ["unfinished", "not run"]
     assert column(found, "comparison", "return>") == ["at 200", "not run"]
@@ -181,7 +181,7 @@ def test_an_evaluation_beside_which_no_trained_policy_lies_does_not_count(tmp_pa
     cell = folder.study.cells[0]
     assert collect_study(folder).results.cells[0].status == "finished"
     (folder.run_path(cell) / POLICY).unlink()
-    assert (folder.evaluation_path(cell).is_file(), folder.is_trained(cell)) == (True, False)
+    assert ((folder.run_path(cell) / FINAL).is_file(), folder.is_trained(cell)) == (True, False)
     assert collect_study(folder).results.cells[0].status == "unfinished"
 
 
@@ -280,6 +280,6 @@ def test_runs_of_other_seeds_than_the_study_are_told(tmp_path):
     more = StudyFolder.open(folder.path)
     with pytest.raises(ValueError, match="its final evaluation has not the 4 seeds of the run"):
         collect_study(more)
-    folder.evaluation_path(folder.study.cells[0]).unlink()
+    (folder.run_path(folder.study.cells[0]) / FINAL).unlink()
     with pytest.raises(ValueError, match="its metrics have 3 seeds, its configuration 4"):
         collect_study(more)

@@ -9,6 +9,7 @@ from typing import Any
 from esp_cli.studies.catalogue import Request, plan
 from esp_cli.studies.plan import Cell, Study
 from esp_cli.studies.study import StudyFolder
+from esp_cli.training.folder_names import FINAL
 from tests.training.runs import TINY
 
 ANCHORS = {"random": -200.0, "heuristic": -100.0}
@@ -35,7 +36,7 @@ def write_run(folder: StudyFolder, cell: Cell, rows: list[list[float | None]], f
     ]
     run.metrics_path.write_text("".join(json.dumps(line) + "\n" for line in lines))
     run.policy_path.write_bytes(b"weights")
-    folder.evaluation_path(cell).write_text(json.dumps(final_evaluation(finals, cell.config.seeds)))
+    (folder.run_path(cell) / FINAL).write_text(json.dumps(final_evaluation(finals, cell.config.seeds)))
 
 
 def final_evaluation(finals: list[float | None], seeds: Sequence[int] = SEEDS) -> dict[str, Any]:

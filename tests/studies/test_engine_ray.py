@@ -33,6 +33,7 @@ from esp_cli.studies.engine_ray import (
 from esp_cli.studies.plan import Cell, Study
 from esp_cli.studies.scheduler import Scheduler
 from esp_cli.studies.study import StudyFolder
+from esp_cli.training.folder_names import FINAL, LOG
 from esp_cli.training.metrics import read_metrics
 from esp_cli.training.run_folder import RunFolder, checkpoints_in, step_of
 from esp_envs.errors import UserError
@@ -107,7 +108,7 @@ def checkpointed(folder: StudyFolder, cell: Cell) -> bool:
 
 
 def log(folder: StudyFolder, cell: Cell) -> str:
-    return folder.log_path(cell).read_text() if folder.log_path(cell).exists() else ""
+    return (folder.run_path(cell) / LOG).read_text() if (folder.run_path(cell) / LOG).exists() else ""
 
 
 def same(folder: StudyFolder, cell: Cell, alone: Path) -> bool:
@@ -143,7 +144,7 @@ def test_a_lost_node_and_a_lost_worker_cost_a_checkpoint_and_change_no_result(cl
     assert scheduler.runs[0].status == "finished", scheduler.runs[0].message
     assert same(folder, cell, alone[cell.name])
     here = Run(alone[cell.name]).evaluate(folder.study.episodes).model_dump(mode="json")
-    there = json.loads(folder.evaluation_path(cell).read_text())
+    there = json.loads((folder.run_path(cell) / FINAL).read_text())
     assert here | {"source": str(folder.run_path(cell))} == there
 
 

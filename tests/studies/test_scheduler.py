@@ -1,5 +1,6 @@
 """The scheduler, over a stand-in that does to run folders what training does."""
 
+import math
 import os
 import signal
 import subprocess
@@ -12,6 +13,7 @@ import pytest
 from esp_cli.studies.engine import APPLICATION, LocalEngine
 from esp_cli.studies.scheduler import Scheduler, makespan
 from esp_cli.studies.study import StudyFolder
+from esp_cli.training.folder_names import FINAL, LOG
 from tests.studies.small_studies import small_study, stand_in, write_study
 
 ROOT = Path(__file__).parents[2]
@@ -46,13 +48,13 @@ def test_every_run_is_trained_and_evaluated_once_and_no_more_than_jobs_at_once(f
     names = [cell.name for cell in folder.study.cells]
     assert sorted(trace(folder)) == sorted([f"{what} {name}" for what in ("eval", "train") for name in names])
     assert max(seen) == 2
-    assert all("$ esp" in folder.log_path(cell).read_text() for cell in folder.study.cells)
+    assert all("$ esp" in (folder.run_path(cell) / LOG).read_text() for cell in folder.study.cells)
 
 
 def test_what_is_finished_is_skipped_and_what_is_trained_is_only_evaluated(tmp_path):
     folder = write_study(tmp_path / "s", small_study(tasks=FOUR), {"MAPPO": [-1.0, -2.0, -3.0]})
     cells = folder.study.cells
-    folder.evaluation_path(cells[0]).unlink()
+    (folder.run_path(cells[0]) / FINAL).unlink()
     assert statuses(run(folder, 1)) == ["finished"] * 4
     assert trace(folder) == [
         f"eval {cells[0].name}",
@@ -67,7 +69,7 @@ def test_what_is_finished_is_skipped_and_what_is_trained_is_only_evaluated(tmp_p
 def test_a_damaged_evaluation_is_made_anew(tmp_path, damage):
     folder = write_study(tmp_path / "s", small_study(), {"MAPPO": [-1.0, -2.0, -3.0]})
     cell = next(cell for cell in folder.study.cells if folder.is_finished(cell))
-    path, mine = folder.evaluation_path(cell), tmp_path / "mine.txt"
+    path, mine = folder.run_path(cell) / FINAL, tmp_path / "mine.txt"
     mine.write_text("mine")
     path.unlink()
     if damage == "link":
@@ -86,7 +88,7 @@ def test_a_run_whose_log_is_a_planted_link_fails_alone(folder, tmp_path):
     mine.write_text("mine")
     bad = folder.study.cells[1]
     folder.prepare(bad)
-    folder.log_path(bad).symlink_to(mine)
+    (folder.run_path(bad) / LOG).symlink_to(mine)
     scheduler = run(folder)
     assert statuses(scheduler) == ["finished", "failed", "finished", "finished"]
     assert "no regular file is there; remove it" in scheduler.runs[1].message
@@ -225,7 +227,7 @@ def test_when_the_last_job_ends():
 
 def test_time_left_is_that_of_the_runs_most_alike(folder):
     scheduler = Scheduler(folder, folder.study.cells, 1, LocalEngine(()))
-    assert scheduler.left_s() is None
+    assert scheduler.left_s() == math.inf
     plain, _, hunt, _ = scheduler.runs
     plain.step, plain.trained_s = 100, 10.0  # of 200 steps, 0.1 s a step
     assert scheduler.left_s() == pytest.approx(0.1 * 700)

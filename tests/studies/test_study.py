@@ -9,6 +9,7 @@ from esp_cli.files.opening import is_held
 from esp_cli.files.writing import TEMPORARY_PREFIX
 from esp_cli.studies.engine import LocalEngine
 from esp_cli.studies.study import StudyFolder, read_evaluation
+from esp_cli.training.folder_names import FINAL, LOG
 from esp_envs.errors import UserError
 from tests.studies.small_studies import small_study, write_study
 
@@ -155,7 +156,7 @@ def test_finished_is_trained_and_evaluated(tmp_path):
     folder = write_study(tmp_path / "s", small_study(), ENDS)
     plain, esp = folder.study.cells
     assert (folder.is_finished(plain), folder.is_finished(esp)) == (True, False)
-    folder.evaluation_path(plain).write_text('{"task": ')  # half of one, as after a power cut
+    (folder.run_path(plain) / FINAL).write_text('{"task": ')  # half of one, as after a power cut
     assert folder.is_trained(plain)
     assert not folder.is_finished(plain)
     assert read_evaluation(folder.run_path(esp)) is None
@@ -179,7 +180,7 @@ def test_a_finished_run_of_the_same_configuration_is_taken_over_from_another_stu
     folder.adopt(plain, twin)
     assert folder.is_finished(plain)
     assert read_evaluation(folder.run_path(plain)) == read_evaluation(twin)
-    assert folder.log_path(plain).read_text().endswith(f"taken over from {twin}\n")
+    assert (folder.run_path(plain) / LOG).read_text().endswith(f"taken over from {twin}\n")
     assert folder.find_twin(plain, [other]) is None, "it is there now"
     assert sorted(path.name for path in folder.run_path(plain).parent.iterdir()) == [plain.name]
 
@@ -187,7 +188,7 @@ def test_a_finished_run_of_the_same_configuration_is_taken_over_from_another_stu
 def test_a_run_of_another_version_of_the_task_is_no_twin_and_its_study_does_not_go_on(tmp_path):
     other = write_study(tmp_path / "other", small_study(), ENDS)
     plain = other.study.cells[0]
-    file = other.evaluation_path(plain)
+    file = other.run_path(plain) / FINAL
     found = json.loads(file.read_text())
     file.write_text(json.dumps(found | {"task_version": found["task_version"] + 1}))
     folder = StudyFolder.create(tmp_path / "s", small_study())

@@ -16,6 +16,7 @@ from esp_cli.studies.catalogue import Request
 from esp_cli.studies.search import Trials, score
 from esp_cli.studies.study import StudyFolder
 from esp_cli.studies.symmetry import METHODS, TASKS, Benchmark, draws
+from esp_cli.training.folder_names import FINAL
 from esp_envs import make
 from esp_envs.errors import UserError
 from tests.studies.small_studies import write_run
@@ -189,7 +190,7 @@ def test_the_report_corrects_for_the_number_of_methods(tmp_path: Path) -> None:
     _, verdict, *steps = answer(replace(material, results=summarised(alone)))
     assert verdict == "ESP is better than plain: the difference is +30.00, p = 0.029 by the rank-sum test."
     assert not any("take" in text for text in steps)
-    folder.evaluation_path(folder.study.cells[2]).unlink()
+    (folder.run_path(folder.study.cells[2]) / FINAL).unlink()
     assert answer(collect_study(folder))[0].endswith(", better than plain: ESP; not finished: copies.")
 
 

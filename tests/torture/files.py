@@ -30,6 +30,7 @@ from esp_cli.studies.study import StudyFolder, read_evaluation
 from esp_cli.symmetry.admission import admitted_elements
 from esp_cli.training.checkpoint import load_checkpoint, save_checkpoint
 from esp_cli.training.config import resolve_config
+from esp_cli.training.folder_names import FINAL
 from esp_cli.training.metrics import column, read_last_row, read_metrics
 from esp_cli.training.run_folder import RUN_FORMAT, RunFolder
 from esp_cli.training.settings import parse_config, read_config_file
@@ -163,7 +164,7 @@ def _make_sound_files(scratch: Path) -> None:
         run = study.prepare(cell)
         with run.lock():
             Trainer(cell.config, run).run(lambda news: True)
-        _run_command(["eval", str(run.path), "--episodes", "4", "--json", str(study.evaluation_path(cell))])
+        _run_command(["eval", str(run.path), "--episodes", "4", "--json", str(study.run_path(cell) / FINAL)])
     recorded = collect(make("navigation", 64, [0]), 64, 2)
     arrays = {name: getattr(recorded, name).numpy() for name in ("obs", "action", "reward", "next_obs")}
     np.savez(scratch / "transitions.npz", **arrays)
@@ -179,7 +180,7 @@ def _make_sound_files(scratch: Path) -> None:
     manifest["policies"] = manifest["policies"][:2]  # the others are alike
     (scratch / KINDS["manifest"].path).write_text(json.dumps(manifest, indent=2))
     cells = study.study.cells
-    (scratch / "evaluation").symlink_to(study.evaluation_path(cells[0]).parent)
+    (scratch / "evaluation").symlink_to((study.run_path(cells[0]) / FINAL).parent)
 
 
 def _run_command(arguments: list[str]) -> str | None:

@@ -14,6 +14,7 @@ from esp_cli.studies.engine import Engine, LocalEngine
 from esp_cli.studies.scheduler import Scheduler
 from esp_cli.studies.study import StudyFolder
 from esp_cli.training import trainer
+from esp_cli.training.folder_names import FINAL
 from tests.benchmarks.growth import family
 from tests.forks import PATIENCE_S, ForkEngine, Job, fork, wait
 from tests.studies.small_studies import request
@@ -83,6 +84,6 @@ def study_state(path: Path) -> str:
     digest = hashlib.sha256((path / "study.json").read_bytes())
     for cell in folder.study.cells:
         digest.update(run_state(folder.run_path(cell)).encode())
-        text = folder.evaluation_path(cell).read_text().replace(str(path), "")
+        text = (folder.run_path(cell) / FINAL).read_text().replace(str(path), "")
         digest.update(text.encode())
     return digest.hexdigest()
