@@ -17,7 +17,6 @@ a proof. And where a run from the images that meets the chance of X gives X itse
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -27,7 +26,7 @@ from torch import Tensor
 from esp_cli.checking.shifting import Unmoved
 from esp_cli.checking.verdicts import NEGLIGIBLE, RANK, SIGNIFICANT, FieldVerdict, concluded
 from esp_cli.symmetry import Transform
-from esp_envs.base import Observation, Step
+from esp_envs.base import Step
 from esp_envs.spec import TaskSpec
 
 TOLERATED = 0.15  # standard deviations that a field with chance may be off, where it is not found broken
@@ -46,6 +45,13 @@ _ULPS = 1e-6  # rounding of a number as a share of it, at least
 Outcomes = dict[str, Tensor]  # what a step gives, by field: [M, numbers]
 
 
+def the_same(name: str, first: Outcomes, alike: Outcomes) -> FieldVerdict | None:
+    """Find that a field holds from outcomes with the chance of `first` that are equal, number by number."""
+    x, y = first[name], alike[name]
+    same = len(x) > 0 and torch.equal(x, y) and bool(x.isfinite().all())
+    return concluded(name, 0.0, 0.0, False, 0.0, 0.0) if same else None
+
+
 def state_by_state(
     name: str, first: Outcomes, second: Outcomes, alike: Outcomes, near: Outcomes
 ) -> FieldVerdict | None:
@@ -54,15 +60,16 @@ def state_by_state(
     `first` are transformed outcomes, `second` the same with other chance, `alike` outcomes from the transformed states
     with the chance of `first`, `near` transformed ones from states that differ by about a rounding, with that chance.
     """
-    x, x2, y, close = first[name], second[name], alike[name], near[name]
-    own, *others, image = (side.isfinite().all(1) for side in (x, x2, close, y))
-    if share := float((torch.stack(others) == own).all(0).logical_and(image != own).float().mean()):
+    sides = [outcomes[name] for outcomes in (first, second, alike, near)]
+    own, again, image, close = (side.isfinite().all(1) for side in sides)
+    if share := float(((again == own) & (close == own) & (image != own)).float().mean()):
         return FieldVerdict(name, "broken", share, 0.0, share=share)  # numbers on one side alone
-    (x, x2, y), known = _known(x, x2, y)
+    known = own & again & image
+    x, x2, y, close = (side[known] for side in sides)
     if not len(x):
         return FieldVerdict(name, "not covered", float("nan"), float("nan"))
     units, scale = _units(name, first, alike, known)
-    rounding = torch.maximum((x - close[known]).abs().amax(1).nan_to_num(), _ULPS * x.abs().amax(1))
+    rounding = torch.maximum((x - close).abs().amax(1).nan_to_num(), _ULPS * x.abs().amax(1))
     found = _each_state(name, (x - y).abs(), _ROUNDINGS * rounding, scale, units)
     is_certain = bool(((x - x2).abs() <= NEGLIGIBLE * units).all())
     return found if is_certain or found.outcome == "holds" else None
@@ -181,27 +188,25 @@ def merged(verdicts: Sequence[FieldVerdict]) -> list[FieldVerdict]:
     return list(best.values())
 
 
-def by_field(steps: Sequence[Step], spec: TaskSpec, transform: Transform | Unmoved) -> Outcomes:
-    """Return everything that the steps gave by field, transformed."""
-    parts = defaultdict[str, list[Tensor]](list)
+def by_field(step: Step, spec: TaskSpec, transform: Transform | Unmoved) -> Outcomes:
+    """Return everything that a step gave by field, transformed; see `stepping.outcomes`."""
+    found = Outcomes()
 
     def add(name: str, rows: Tensor) -> None:
-        parts[name].append(rows.float().flatten(0, 1).flatten(1))
+        found[name] = rows.float().flatten(0, 1).flatten(1)
 
-    for step in steps:
-        for prefix, seen in (("start ", step.next), ("", step.final)):
-            assert isinstance(seen, Observation)
-            if prefix and not bool(seen.obs.isfinite().any()):
-                continue  # a simulator of others does not say what is seen before a step
-            rows = [("obs", spec.observation, transform.obs(seen.obs))]
-            rows += [] if spec.is_joint else [("state", spec.state, transform.state(seen.state))]
-            for what, layout, row in rows:
-                for name, where in layout.slices().items():
-                    add(f"{prefix}{what}.{name}", row[..., where])
-            if seen.action_mask is not None:
-                add(f"{prefix}action mask", transform.push_outputs(seen.action_mask))
-            if seen.alive is not None:
-                add(f"{prefix}alive", transform.per_agent(seen.alive))
-        add("reward", transform.per_agent(step.reward))
-        add("end", step.terminated.unsqueeze(-1))
-    return {name: torch.cat(rows) for name, rows in parts.items()}
+    for prefix, seen in (("start ", step.next), ("", step.reached)):
+        if prefix and not bool(seen.obs.isfinite().any()):
+            continue  # a simulator of others does not say what is seen before a step
+        rows = [("obs", spec.observation, transform.obs(seen.obs))]
+        rows += [] if spec.is_joint else [("state", spec.state, transform.state(seen.state))]
+        for what, layout, row in rows:
+            for name, where in layout.slices().items():
+                add(f"{prefix}{what}.{name}", row[..., where])
+        if seen.action_mask is not None:
+            add(f"{prefix}action mask", transform.push_outputs(seen.action_mask))
+        if seen.alive is not None:
+            add(f"{prefix}alive", transform.per_agent(seen.alive))
+    add("reward", transform.per_agent(step.reward))
+    add("end", step.terminated.unsqueeze(-1))
+    return found

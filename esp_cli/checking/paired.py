@@ -21,6 +21,7 @@ from esp_cli.checking.comparison import (
     by_field,
     merged,
     state_by_state,
+    the_same,
 )
 from esp_cli.checking.shifting import Shift, Unmoved
 from esp_cli.checking.stepping import nudged, outcomes, played, seek_end, stretched, visit
@@ -170,24 +171,26 @@ class _Pairs:
     def judge(self, element: Element | Shift) -> ElementVerdict:
         """Compare the steps from the images with the images of the steps."""
         declared, transform = is_declared(element, self._spec), self._transform(element)
+        image = cache(partial(self._image, transform))
 
         @cache
         def apart() -> list[Outcomes]:
             return [self._there(transform, twin, seed) for twin, seed in enumerate(_THERE)]
 
-        first, second, near = self._images(transform)
+        first = image(0)
         try:
             alike = self._there(transform, 0, _HERE[0])
             verdicts = [
                 self._unseen(name, first, alike)
-                or state_by_state(name, first, second, alike, near)
-                or beside_what_is_seen(name, (first, second, *apart()), near)
-                or by_distances(name, (first, second, *apart()))
+                or the_same(name, first, alike)
+                or state_by_state(name, first, image(1), alike, image(2))
+                or beside_what_is_seen(name, (first, image(1), *apart()), image(2))
+                or by_distances(name, (first, image(1), *apart()))
                 for name in first
             ]
             if all(v.outcome == "holds" for v in verdicts) and any(math.isnan(v.share) for v in verdicts):
-                drawn = [name for name in first if not torch.equal(first[name], second[name])]
-                verdicts.append(by_distances(_TOGETHER, (first, second, *apart()), drawn))
+                drawn = [name for name in first if not torch.equal(first[name], image(1)[name])]
+                verdicts.append(by_distances(_TOGETHER, (first, image(1), *apart()), drawn))
         except (Exception, SystemExit) as error:
             reason = f"the task raises in the transformed states: {type(error).__name__}: {error}"
             return ElementVerdict(element.name, declared, (), reason)
@@ -199,19 +202,24 @@ class _Pairs:
         None where chance or rounding decides some field, and none is broken, or the task raises.
         """
         transform = self._transform(element)
-        first, second, near = self._images(transform)
+        first, worlds = self._image(transform, 0), self._visited[0][0].shape[1]
         try:
             alike = self._there(transform, 0, _HERE[0])
         except (Exception, SystemExit):
             return None
-        sides, worlds = (first, second, alike, near), self._visited[0][0].shape[1]
+        # of one world alone, one half has no rows, and so nothing is said
+        unlike = [name for name in first if worlds == 1 or not the_same(name, first, alike)]
+        if not unlike:
+            return ()
+        second, near = self._image(transform, 1), self._image(transform, 2)
+        sides = (first, second, alike, near)
         goes = _until_an_end(sides, worlds)
         # in either half of the worlds: an event that rounding tips in one of them is no breaking
         soon = goes.clone()
         soon[worlds * _LATER_OF_SLOW :] = False
         halves = [_kept(sides, soon & (torch.arange(len(goes), device=goes.device) % 2 == k)) for k in (0, 1)]
         whole = _kept(sides, goes)
-        names = list(whole[0])
+        names = [name for name in whole[0] if name in unlike]
         verdicts = {name: [state_by_state(name, *half) for half in halves] for name in names}
         verdicts |= {f"{name} later": [state_by_state(name, *whole)] for name in names}
         if drawn := [name for name in names if None in verdicts[name]]:
@@ -241,8 +249,9 @@ class _Pairs:
     def _transform(self, element: Element | Shift) -> Transform | Unmoved:
         return element if isinstance(element, Shift) else build_transform([element], self._spec)
 
-    def _images(self, transform: Transform | Unmoved) -> list[Outcomes]:
-        return [by_field(steps, self._spec, transform) for steps in self._here]
+    def _image(self, transform: Transform | Unmoved, run: int) -> Outcomes:
+        """Return transformed outcomes of one of the runs from the states: two, and one from states nearby."""
+        return by_field(self._here[run], self._spec, transform)
 
     def _there(self, transform: Transform | Unmoved, twin: int, seed: int) -> Outcomes:
         """Return outcomes of the images."""

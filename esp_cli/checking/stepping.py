@@ -17,7 +17,7 @@ from esp_cli.checking.recorded import picked
 from esp_cli.checking.shifting import Unmoved
 from esp_cli.checking.verdicts import Watch, stop_at
 from esp_cli.symmetry import Element, Transform, build_transform
-from esp_envs.base import Environment, Step, joined
+from esp_envs.base import Environment, Observation, Step, joined
 from esp_envs.errors import UserError
 from esp_envs.promises import MakeWorlds
 from esp_envs.spec import Continuous, Layout, TaskSpec
@@ -64,12 +64,13 @@ def outcomes(
     seed: int,
     until: float,
     onwards: bool = False,
-) -> list[Step]:
-    """Return the steps from each moment's states; the start's observation replaces `next` of the episode's end.
+) -> Step:
+    """Return the steps from each moment's states as one step, of as many worlds as all moments have together.
 
-    `turned` makes the images. Agents of other roles act at random with the run's `seed`,
-    alike in each run, in images turned. With `onwards` episodes go on from the first moment's states, with the actions
-    of all moments: clocks run, and what no state holds builds up.
+    What is seen at the start replaces `next`; moments at which a simulator does not say it are left out there.
+    `turned` makes the images. Agents of other roles act at random with the run's `seed`, alike in each run, in images
+    turned. With `onwards` episodes go on from the first moment's states, with the actions of all moments: clocks run,
+    and what no state holds builds up.
     """
     _begin(env, len(visited), turned, seed)
     steps, seen = list[Step](), None
@@ -79,9 +80,28 @@ def outcomes(
             env.reset()
             seen = env.set_state(turned.state(state))
         step = env.step(turned.action(action))
-        steps.append(replace(step, next=seen, final=step.reached, metrics={}))
+        steps.append(replace(step, next=seen, final=step.reached))
         seen = step.next
-    return steps
+    starts = [step.next for step in steps if bool(step.next.obs.isfinite().any())]
+    return Step(
+        next=_side_by_side(starts or [steps[0].next]),
+        reward=torch.cat([step.reward for step in steps], 1),
+        terminated=torch.cat([step.terminated for step in steps], 1),
+        truncated=torch.cat([step.truncated for step in steps], 1),
+        final=_side_by_side([step.reached for step in steps]),
+        metrics={},
+    )
+
+
+def _side_by_side(seen: Sequence[Observation]) -> Observation:
+    masks = [one.action_mask for one in seen if one.action_mask is not None]
+    alive = [one.alive for one in seen if one.alive is not None]
+    return Observation(
+        torch.cat([one.obs for one in seen], 1),
+        torch.cat([one.state for one in seen], 1),
+        torch.cat(masks, 1) if masks else None,
+        torch.cat(alive, 1) if alive else None,
+    )
 
 
 def _begin(env: Environment, steps: int, turned: Transform | Unmoved, seed: int) -> None:
