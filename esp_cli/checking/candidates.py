@@ -87,7 +87,7 @@ def _refusal(element: Element, spaces: Spaces) -> str | None:
 def _moved(element: Element, spaces: Spaces) -> tuple[float, ...]:
     """Return where an element moves some numbers of a task, in thousandths: the same for those that move all alike."""
     transform, agents = build_transform([element], spaces), spaces.num_agents
-    generator = torch.Generator().manual_seed(0)
+    generator, outputs = torch.Generator().manual_seed(0), transform.num_outputs
 
     def drawn(*shape: int) -> Tensor:
         return torch.rand(1, 1, *shape, generator=generator, dtype=torch.float64).float()
@@ -95,7 +95,7 @@ def _moved(element: Element, spaces: Spaces) -> tuple[float, ...]:
     parts = (
         transform.obs(drawn(agents, spaces.observation.width)),
         transform.state(drawn(spaces.state.width)),
-        transform.push_outputs(drawn(agents, transform.num_outputs)),
+        transform.push_outputs(torch.arange(1.0, agents * outputs + 1).view(1, 1, agents, outputs)),
         transform.per_agent(torch.arange(float(agents)).view(1, 1, -1)),
     )
     return tuple(round(1000 * number) + 0.0 for part in parts for number in part.flatten().tolist())

@@ -207,8 +207,7 @@ class _Pairs:
             alike = self._there(transform, 0, _HERE[0])
         except (Exception, SystemExit):
             return None
-        # of one world alone, one half has no rows, and so nothing is said
-        unlike = [name for name in first if worlds == 1 or not the_same(name, first, alike)]
+        unlike = [name for name in first if not the_same(name, first, alike)]
         if not unlike:
             return ()
         second, near = self._image(transform, 1), self._image(transform, 2)

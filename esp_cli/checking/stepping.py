@@ -80,7 +80,7 @@ def outcomes(
             env.reset()
             seen = env.set_state(turned.state(state))
         step = env.step(turned.action(action))
-        steps.append(replace(step, next=seen, final=step.reached))
+        steps.append(replace(step, next=seen, final=step.reached, metrics={}))
         seen = step.next
     starts = [step.next for step in steps if bool(step.next.obs.isfinite().any())]
     return Step(

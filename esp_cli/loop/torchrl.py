@@ -142,7 +142,7 @@ class SymmetricLoss(nn.Module):
 
         actor: Any = getattr(self.loss, "actor_network", None)
         hooks = [critic.register_forward_hook(hear_value)]
-        if actor is not None:
+        if hasattr(actor, "det_part"):
             hooks.append(actor.det_part.register_forward_hook(hear_policy))
         try:
             losses = self.loss(data)
@@ -151,4 +151,8 @@ class SymmetricLoss(nn.Module):
                 hook.remove()
         if value is None:
             raise UserError(f"{type(self.loss).__name__} did not ask its critic; give it one")
+        if not policies and not self.mixes:
+            raise UserError(
+                f"{type(actor).__name__} did not say its policy; give a ProbabilisticActor of one distribution"
+            )
         return losses, policies, list(value.split(size))

@@ -60,7 +60,7 @@ def passed(make: Callable[..., Any], inputs: Sequence[Tensor], parameters: Seque
 class Deferred(WithVJP):
     """What a perceptron returns for rows, computed where somebody asks for it; where it `may_learn`, see `learn`.
 
-    Nothing may change in place before the VJP is used.
+    Rows and parameters may not change in place before the outputs are asked for and the VJP is used.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """Losses as weighted sums of equations on what networks output, and the paper's consistency losses among them.
 
 S_pi (Eq. 8), S_V (Eq. 9) and S_Q (supplement eq. 19) are stated once, element by element. Learners average them with
-their slopes (`policy_gap`, `value_gap`); a foreign training loop gives them to autograd.
+their slopes (`consistency_gap`); a foreign training loop gives them to autograd.
 """
 
 from __future__ import annotations

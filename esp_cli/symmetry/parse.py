@@ -100,7 +100,7 @@ def _item(part: str, text: str, num_agents: int) -> tuple[Element, ...] | Group:
     factors = [_factor(word.strip(), text, num_agents) for word in part.split("*")]
     groups = [factor for factor in factors if isinstance(factor, Group)]
     if len(groups) == len(factors):
-        of_scene = [rank(group)[0] == 0 for group in groups]
+        of_scene = [not any(isinstance(aspect, str) for aspect in group.aspects) for group in groups]
         ordered = len(groups) == 1 or not of_scene[-1]
         if are_independent(groups) and (ordered or all(of_scene)):
             group = direct_product(*sorted(groups, key=rank))

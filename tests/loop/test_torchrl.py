@@ -220,6 +220,17 @@ def test_without_copies_the_loss_is_that_of_the_originals() -> None:
     assert both["loss_objective"].item() != pytest.approx(plain["loss_objective"].item(), rel=1e-3)
 
 
+def test_an_actor_of_a_way_of_its_own_is_refused() -> None:
+    class Direct(ProbabilisticActor):
+        def get_dist(self, tensordict: TensorDict) -> torch.distributions.Distribution:
+            return self.build_dist_from_params(self.module[0](tensordict))
+
+    loss = ppo(ClipPPOLoss)
+    loss.actor_network.__class__ = Direct
+    with pytest.raises(ValueError, match="Direct did not say its policy; give a ProbabilisticActor of one distribution"):
+        SymmetricLoss(loss, symmetry(), 0.1)(rows())
+
+
 def mixer_loss() -> QMixerLoss:
     torch.manual_seed(0)
     q = TensorDictModule(nn.Linear(WIDTH, 4), [("agents", "observation")], [("agents", "action_value")])

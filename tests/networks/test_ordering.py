@@ -6,7 +6,7 @@ import torch
 from esp_cli.export.program import program_of
 from esp_cli.networks.build import build_network
 from esp_cli.networks.contract import IoSpec
-from esp_cli.networks.ordering import NearestFirst
+from esp_cli.networks.ordering import NearestFirst, items_of
 from esp_cli.networks.plain import GruConfig, MlpConfig
 from esp_cli.training.build import build_learner, generators
 from esp_cli.training.config import resolve_config
@@ -37,6 +37,12 @@ def test_things_are_sorted_by_hand_and_joined_numbers_go_along():
     # landmarks at distances 5, 1, 2; the others at 5 and 1 have 10 and 20 of fuel; what stands behind stays
     expected = [0, 1, 0, -2, 3, 4, -1, 0, 5, 0, 20, 10, 99]
     assert network.sorted(torch.cat([row, torch.tensor([99.0])])).tolist() == expected
+
+
+def test_items_of_records_begin_at_columns_of_their_own():
+    pair = Field("pair", Kind.RECORD, 2, parts=(Field("at", Kind.VECTOR), Field("fuel", Kind.SCALAR)))
+    columns = [(field.name, column) for field, column in items_of([pair, Field("time", Kind.SCALAR)])]
+    assert columns == [("at", 0), ("fuel", 2), ("at", 3), ("fuel", 5), ("time", 6)]
 
 
 def test_places_are_near_by_the_own_place():
