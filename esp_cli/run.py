@@ -24,7 +24,7 @@ from esp_cli.algorithms.learner import Learner
 from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.checking.measured import prepared
 from esp_cli.defaults import EPISODES, STEPS
-from esp_cli.files.formatting import Shown, file_name, format_count
+from esp_cli.files.formatting import Shown, attempting, file_name, format_count
 from esp_cli.machine import resolve_device
 from esp_cli.networks.contract import NetworkConfig
 from esp_cli.policies.evaluation import FinalEvaluation
@@ -188,14 +188,18 @@ def begin(config: RunConfig, weights: Mapping[str, Tensor] | None, out: str | os
     names = file_name(config.task), file_name(config.algorithm), config.prior.kind, time.strftime("%Y%m%d-%H%M%S")
     first = Path("runs") / "-".join(names)
     numbered = (first.with_name(f"{first.name}-{k}") for k in itertools.count(2))
-    path = next(path for path in itertools.chain([first], numbered) if not path.exists()) if out is None else Path(out)
-    try:
-        folder = RunFolder.create(path, config.model_dump(mode="json"), initial=weights)
-    except UserError:
-        if out is not None or not path.exists():
-            raise
-        return begin(config, weights, None)  # another program took the name meanwhile
-    return Run(folder.path)
+    path = next(filter(_is_made, itertools.chain([first], numbered))) if out is None else Path(out)
+    return Run(RunFolder.create(path, config.model_dump(mode="json"), initial=weights).path)
+
+
+def _is_made(path: Path) -> bool:
+    """Make a folder, unless there is one, of whatever program."""
+    with attempting("make the run folder", path):
+        try:
+            path.mkdir(parents=True)
+        except FileExistsError:
+            return False
+    return True
 
 
 def train(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -133,27 +132,32 @@ class Lockstep:
 
     def run(self, jobs: Sequence[Callable[[], T]]) -> list[T]:
         """Run one job for each role until all have ended, and return what they return; the first error ends all."""
+        results: dict[int, T] = {}
+        errors: list[BaseException] = []
 
-        def work(k: int) -> T:
+        def work(k: int) -> None:
             with self._computing:
                 try:
-                    result = jobs[k]()
+                    results[k] = jobs[k]()
                     self._wait(k, "the end")
-                except BaseException:  # whatever it is, the others wait for it
+                except BaseException as error:  # whatever it is, the others wait for it
+                    errors.append(error)
                     self._all.abort()
-                    raise
-                return result
 
-        with ThreadPoolExecutor(len(jobs)) as pool:
-            ends = [pool.submit(work, k) for k in range(len(jobs))]
-            try:
-                wait(ends)
-            except BaseException:  # an interrupt
-                self._all.abort()
-                raise
+        threads = [threading.Thread(target=work, args=(k,), daemon=True) for k in range(len(jobs))]
+        try:
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join()
+        except BaseException:  # an interrupt
+            self._all.abort()
+            raise
         self._all.reset()
-        ends.sort(key=lambda end: isinstance(end.exception(), threading.BrokenBarrierError))
-        return [end.result() for end in ends]
+        real = [error for error in errors if not isinstance(error, threading.BrokenBarrierError)]
+        if errors:
+            raise (real or errors)[0]
+        return [results[k] for k in range(len(jobs))]
 
     def reset(self, k: int) -> Observation:
         self._wait(k, "a new episode")

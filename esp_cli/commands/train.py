@@ -21,6 +21,7 @@ from esp_envs.errors import UserError
 if TYPE_CHECKING:
     from esp_cli.run import Run
     from esp_cli.training.config import RunConfig
+    from esp_cli.training.trackers import Guarded, Tracker
     from esp_cli.training.trainer import Progress, Trainer
 
 EPILOG = """Examples:\n
@@ -162,13 +163,7 @@ def _train(run: Run, trackers: Sequence[str], watch: bool, check: bool) -> None:
             return
         config = run.config
         _announce(config, run.path, trainer.step)
-        page = None
-        if watch:
-            from esp_cli.reporting.live import LIVE, LivePage
-            from esp_cli.training.trackers import Guarded
-
-            page = Guarded("--watch", lambda: LivePage(trainer), console.note)  # where it fails the run goes on
-            console.note(f"watch it in a browser: {(run.path / LIVE).resolve().as_uri()}")
+        page = _watched(trainer) if watch else None
         anchors = rough_anchors(config, 2 * config.evaluation.episodes)
         with console.TrainingProgress(config.steps, len(config.seeds), trainer.step, config.task) as progress:
 
@@ -190,6 +185,20 @@ def _train(run: Run, trackers: Sequence[str], watch: bool, check: bool) -> None:
         )
         raise typer.Exit(130)
     _report(trainer, run.path, config, anchors)
+
+
+def _watched(trainer: Trainer) -> Guarded:
+    """Return what draws the page of a run; where it fails the user is told, and the run goes on."""
+    from esp_cli.training.trackers import Guarded
+
+    def opened() -> Tracker:
+        from esp_cli.reporting.live import LivePage
+
+        page = LivePage(trainer)
+        console.note(f"watch it in a browser: {page.path.resolve().as_uri()}")
+        return page
+
+    return Guarded("--watch", opened, console.note)
 
 
 def _announce(config: RunConfig, path: Path, step: int) -> None:

@@ -95,6 +95,8 @@ class TrainedPolicy:
                 f"{self.source} was trained with other {part} than the task has with {names} "
                 f"changed; change only what a policy neither sees nor does{known}"
             )
+        if spec.observation == self.spec.observation and not numbers:  # whatever the task declares of itself now
+            return replace(self, config=config, spec=spec)
         policy = _untrained(config, spec)
         policy.load_state_dict(self.policy.state_dict())
         return replace(self, config=config, spec=spec, policy=policy)

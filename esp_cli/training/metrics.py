@@ -81,7 +81,7 @@ def read_metrics(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
 def read_last_row(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Read the newest whole row of a metrics file that may be in use; empty where there is none yet."""
     size, row = _TAIL_BYTES, None
-    with contextlib.suppress(OSError), Path(path).open("rb") as file:
+    with contextlib.suppress(OSError), open_regular(path) as file:
         end = start = file.seek(0, os.SEEK_END)
         while row is None and start > 0 and size <= 2 * _MAX_LINE_BYTES:
             start = file.seek(max(0, end - size))
@@ -146,6 +146,10 @@ class Metrics(Shown, dict[str, Floats]):
         self._whole = {name for name, kind in kinds.items() if kind is not list}
         for name in kinds:
             _, values = column(rows, name)
+            if name not in self._whole and values.shape[1] != len(self.seeds):
+                raise UserError(
+                    f"the metrics are damaged: '{name}' has {values.shape[1]} seeds, the run {len(self.seeds)}"
+                )
             self[name] = np.full((len(rows), values.shape[1]), math.nan)
             self[name][[name in row for row in rows]] = values
 

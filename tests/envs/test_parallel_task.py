@@ -89,6 +89,15 @@ def test_a_parallel_task_keeps_every_promise(workers: int) -> None:
     }
 
 
+def test_actions_may_be_written_as_lists() -> None:
+    class Listed(Walking):
+        action = Discrete(Kind.SCALAR, [[0.0], [1.0], [2.0]], ["stay", "walk", "run"])
+
+    one, same = worlds(Listed), worlds(Walking)
+    one.reset(), same.reset()
+    assert same_step(one.step(one.random_action()), same.step(same.random_action()))
+
+
 def test_workers_change_no_number() -> None:
     here, there = worlds(Walking, workers=0), worlds(Walking, workers=3)
     assert torch.equal(here.reset().obs, there.reset().obs)

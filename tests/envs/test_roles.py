@@ -4,6 +4,7 @@
 
 import json
 import shutil
+import signal
 import subprocess
 import threading
 from pathlib import Path
@@ -133,6 +134,14 @@ def test_the_first_error_ends_all_learners_and_they_go_on_afterwards():
         lockstep.run([views[0].reset, lambda: None])
     assert len(lockstep.run([views[0].reset, views[1].reset])) == 2
     assert threading.active_count() < 10
+
+
+def test_an_interrupt_waits_for_no_learner():
+    hangs, main = threading.Event(), threading.main_thread().ident
+    threading.Timer(0.2, signal.pthread_kill, [main, signal.SIGINT]).start()
+    with pytest.raises(KeyboardInterrupt):
+        Lockstep(worlds()).run([hangs.wait, hangs.wait])
+    hangs.set()
 
 
 def test_an_order_of_one_roles_agents_moves_what_others_see_of_them():

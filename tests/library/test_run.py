@@ -12,8 +12,6 @@ from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.run import begin
 from esp_cli.training.config import resolve_config
 from esp_cli.training.metrics import Metrics, column, read_metrics
-from esp_cli.training.run_folder import RunFolder
-from esp_envs.errors import UserError
 from tests.cli.running import esp
 
 SMALL = {"mappo.num_envs": 4, "mappo.num_steps": 25, "evaluation.every_steps": 200, "evaluation.episodes": 2}
@@ -165,21 +163,14 @@ def test_what_is_not_a_run_is_refused(run: Run, tmp_path: Path) -> None:
         run.render(tmp_path / "film.txt")
 
 
-def test_a_name_that_another_program_takes_meanwhile_is_left_to_it(tmp_path, monkeypatch):
+def test_a_name_that_another_program_has_taken_is_left_to_it(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("time.strftime", lambda _: "20261125-090121")
-    create, asked = RunFolder.create, []
-
-    def late(path: Path, *given: object, **named: object) -> RunFolder:
-        asked.append(path.name)
-        if len(asked) == 1:
-            path.mkdir(parents=True)
-            raise UserError(f"{path} is in use")
-        return create(path, *given, **named)
-
-    monkeypatch.setattr(RunFolder, "create", late)
-    train(steps=8, settings={"mappo.num_envs": 2, "task.horizon": 4, "evaluation.episodes": 1})
-    assert asked == ["navigation-mappo-esp-20261125-090121", "navigation-mappo-esp-20261125-090121-2"]
+    taken = tmp_path / "runs/navigation-mappo-esp-20261125-090121"
+    taken.mkdir(parents=True)
+    run = train(steps=8, settings={"mappo.num_envs": 2, "task.horizon": 4, "evaluation.episodes": 1})
+    assert run.path.name == f"{taken.name}-2"
+    assert not [*taken.iterdir()]
 
 
 def test_runs_metrics_policies_and_symmetries_say_what_they_are(run: Run) -> None:

@@ -227,7 +227,7 @@ def test_an_actor_of_a_way_of_its_own_is_refused() -> None:
 
     loss = ppo(ClipPPOLoss)
     loss.actor_network.__class__ = Direct
-    with pytest.raises(ValueError, match="Direct did not say its policy; give a ProbabilisticActor of one distribution"):
+    with pytest.raises(ValueError, match="Direct did not say its policy; give a ProbabilisticActor of one"):
         SymmetricLoss(loss, symmetry(), 0.1)(rows())
 
 

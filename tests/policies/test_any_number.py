@@ -1,6 +1,7 @@
 """A policy whose weights know no number of agents acts with any: evaluated, drawn, loaded and trained on."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +44,13 @@ def test_loaded_it_acts_on_any_number_and_as_it_was_trained_on_the_first(three: 
     assert all(torch.equal(tensor, after[name]) for name, tensor in before.items())
     with pytest.raises(UserError, match=r"needs \(\.\.\., 14\)"):
         one.act(rows)
+
+
+def test_an_equivariant_policy_acts_where_its_symmetry_is_not_declared(tmp_path: Path, monkeypatch) -> None:
+    trained = TrainedPolicy.read(train_tiny(tmp_path / "run", "--network", "equivariant"))
+    monkeypatch.setattr("esp_cli.policies.loading.spec_of", lambda _: replace(trained.spec, symmetry="c1"))
+    windy = trained.transfer({"wind": 0.3})
+    assert (windy.spec.symmetry, windy.policy) == ("c1", trained.policy)
 
 
 def test_a_run_with_another_number_starts_from_actor_critic_and_statistics(three: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 
 import numpy as np
 import pytest
@@ -149,6 +150,19 @@ def test_the_last_row_is_found_however_long_it_is(path, monkeypatch):
     assert read_last_row(path) == ROWS[-1]
     path.write_text("torn")
     assert read_last_row(path) == {}
+
+
+def test_a_pipe_in_its_place_is_waited_for_by_nobody(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    os.mkfifo(path)
+    assert read_last_row(path) == {}
+    with pytest.raises(UserError, match="is not a regular file"):
+        read_metrics(path)
+
+
+def test_metrics_of_other_seeds_than_the_run_has_are_refused():
+    with pytest.raises(UserError, match="the metrics are damaged: 'a' has 2 seeds, the run 3"):
+        metrics.Metrics([{"step": 1, "a": [1.0, 2.0]}], [0, 1, 2])
 
 
 def test_a_file_of_forty_gigabytes_that_holds_nothing_is_one_sentence(tmp_path):

@@ -90,8 +90,10 @@ class ParallelTask(CopyHooks, Environment):
 
     def _described(self, one: Copy) -> TaskSpec:
         """Return the spec, with roles where agents of several kinds learn."""
+        counts = Counter(kind.name for kind in one.kinds.values())
+        of_name = {kind.name: kind for kind in reversed(one.kinds.values())}
         return spec_with_roles(
-            [replace(kind, num_agents=count) for kind, count in Counter(one.kinds.values()).items()],
+            [replace(of_name[name], num_agents=count) for name, count in counts.items()],
             name=type(self).__name__.lower(),
             version=1,
             convention=self.convention,
