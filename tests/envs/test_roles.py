@@ -138,10 +138,15 @@ def test_the_first_error_ends_all_learners_and_they_go_on_afterwards():
 
 def test_an_interrupt_waits_for_no_learner():
     hangs, main = threading.Event(), threading.main_thread().ident
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # what runs in the background ignores it
     threading.Timer(0.2, signal.pthread_kill, [main, signal.SIGINT]).start()
-    with pytest.raises(KeyboardInterrupt):
-        Lockstep(worlds()).run([hangs.wait, hangs.wait])
-    hangs.set()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            Lockstep(worlds()).run([lambda: hangs.wait(60)] * 2)
+        assert not hangs.is_set()
+    finally:
+        hangs.set()
+        signal.signal(signal.SIGINT, before)
 
 
 def test_an_order_of_one_roles_agents_moves_what_others_see_of_them():
