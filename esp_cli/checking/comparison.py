@@ -24,6 +24,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.checking.shifting import Unmoved
+from esp_cli.checking.stepping import is_told
 from esp_cli.checking.verdicts import NEGLIGIBLE, RANK, SIGNIFICANT, FieldVerdict, concluded
 from esp_cli.symmetry import Transform
 from esp_envs.base import Step
@@ -68,7 +69,7 @@ def state_by_state(
     x, x2, y, close = (side[known] for side in sides)
     if not len(x):
         return FieldVerdict(name, "not covered", float("nan"), float("nan"))
-    units, scale = _units(name, first, alike, known)
+    units, scale = _units(x, y, _before(name, first, known))
     rounding = torch.maximum((x - close).abs().amax(1).nan_to_num(), _ULPS * x.abs().amax(1))
     found = _each_state(name, (x - y).abs(), _ROUNDINGS * rounding, scale, units)
     is_certain = bool(((x - x2).abs() <= NEGLIGIBLE * units).all())
@@ -103,7 +104,8 @@ def by_distances(
     rows, known = _known(*(torch.cat([side[field] for field in fields], 1) for side in sides))
     if not len(rows[0]):
         return FieldVerdict(name, "not covered", float("nan"), float("nan"))
-    each = [_units(field, sides[0], sides[2], known)[0] for field in fields]
+    pairs = ((sides[0][field][known], sides[2][field][known], _before(field, sides[0], known)) for field in fields)
+    each = [_units(*pair)[0] for pair in pairs]
     units, shares = torch.cat(each), torch.cat([torch.full_like(unit, len(unit) ** -0.5) for unit in each])
     x, x2, y, y2 = (side / units for side in rows)
     within, across = ((x - x2, y - y2), (x - y, x2 - y2, x - y2, x2 - y))
@@ -149,13 +151,16 @@ def _known(*sides: Tensor) -> tuple[list[Tensor], Tensor]:
     return [side[known] for side in sides], known
 
 
-def _units(name: str, first: Outcomes, image: Outcomes, known: Tensor) -> tuple[Tensor, float]:
-    """Return in which unit each number of a field is compared, and the field's spread: the unit, or a larger one."""
-    x, y = first[name][known], image[name][known]
-    scale = max(float(torch.cat([x, y]).std(0).max()), 1e-6)
+def _before(name: str, first: Outcomes, known: Tensor) -> Tensor | None:
+    """Return what a field was at the start, in some rows; None where a simulator of others does not say so."""
     before = first.get(f"start {name}", first[name])
-    # some simulators of others do not say what is seen at the start
-    change = x - before[known] if len(before) == len(known) else torch.zeros_like(x)
+    return before[known] if len(before) == len(known) else None
+
+
+def _units(x: Tensor, y: Tensor, before: Tensor | None) -> tuple[Tensor, float]:
+    """Return in which unit each number of a field is compared, and the field's spread: the unit, or a larger one."""
+    scale = max(float(torch.cat([x, y]).std(0).max()), 1e-6)
+    change = torch.zeros_like(x) if before is None else x - before
     own = torch.where(change.any(0), torch.minimum(x.std(0), change.nan_to_num().std(0)), x.std(0))
     return torch.where(own < _SMALL * scale, own.clamp_min(NEGLIGIBLE * scale), scale).clamp_min(1e-6), scale
 
@@ -196,8 +201,8 @@ def by_field(step: Step, spec: TaskSpec, transform: Transform | Unmoved) -> Outc
         found[name] = rows.float().flatten(0, 1).flatten(1)
 
     for prefix, seen in (("start ", step.next), ("", step.reached)):
-        if prefix and not bool(seen.obs.isfinite().any()):
-            continue  # a simulator of others does not say what is seen before a step
+        if prefix and not is_told(seen):
+            continue
         rows = [("obs", spec.observation, transform.obs(seen.obs))]
         rows += [] if spec.is_joint else [("state", spec.state, transform.state(seen.state))]
         for what, layout, row in rows:

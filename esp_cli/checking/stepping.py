@@ -82,7 +82,7 @@ def outcomes(
         step = env.step(turned.action(action))
         steps.append(replace(step, next=seen, final=step.reached, metrics={}))
         seen = step.next
-    starts = [step.next for step in steps if bool(step.next.obs.isfinite().any())]
+    starts = [step.next for step in steps if is_told(step.next)]
     return Step(
         next=_side_by_side(starts or [steps[0].next]),
         reward=torch.cat([step.reward for step in steps], 1),
@@ -91,6 +91,11 @@ def outcomes(
         final=_side_by_side([step.reached for step in steps]),
         metrics={},
     )
+
+
+def is_told(seen: Observation) -> bool:
+    """Return whether a simulator says what is seen; some of others do not before a step."""
+    return bool(seen.obs.isfinite().any())
 
 
 def _side_by_side(seen: Sequence[Observation]) -> Observation:

@@ -223,8 +223,8 @@ def _state(folder: StudyFolder, cell: Cell, mode: Mode) -> _State:
         wanted = len(cell.config.seeds)
         if any(len(returns.per_seed) != wanted for returns in (final.greedy, final.stochastic)):
             raise UserError(f"{run} does not fit its study: its final evaluation has not the {wanted} seeds of the run")
-    step = read_last_row(run / METRICS).get("step", 0)
-    return _State(step, begun_curve(run, cell, mode), final)
+    curve = begun_curve(run, cell, mode)
+    return _State(curve.trained if curve else read_last_row(run / METRICS).get("step", 0), curve, final)
 
 
 def _results(study: Study, states: Mapping[str, _State], mode: Mode, thresholds: Sequence[float]) -> Results:

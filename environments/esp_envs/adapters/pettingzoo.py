@@ -91,7 +91,7 @@ class ParallelTask(CopyHooks, Environment):
     def _described(self, one: Copy) -> TaskSpec:
         """Return the spec, with roles where agents of several kinds learn."""
         counts = Counter(kind.name for kind in one.kinds.values())
-        of_name = {kind.name: kind for kind in reversed(one.kinds.values())}
+        of_name = {kind.name: kind for kind in one.kinds.values()}
         return spec_with_roles(
             [replace(of_name[name], num_agents=count) for name, count in counts.items()],
             name=type(self).__name__.lower(),
