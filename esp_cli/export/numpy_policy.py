@@ -45,8 +45,15 @@ class NumpyPolicy:
         return np.zeros((*lead, self.hidden + self.previous), np.float32)
 
     def step(self, obs: Any, memory: Any, action_mask: Any = None, sets: Any = None) -> tuple[Any, Any]:
-        """Return actions, and the memory [..., H] after them."""
+        """Return actions, and the memory [..., H] after them.
+
+        Raises:
+            ValueError: other shapes, or numbers that are not finite.
+        """
         outputs, hidden = self.outputs(obs, memory, sets)
+        for what, rows in {"the observation": obs, "the memory": memory, **(sets or {})}.items():
+            if not np.isfinite(np.asarray(rows, np.float32)).all():
+                raise ValueError(f"{what} holds a number that is not finite; check what the sensors gave")
         if self.program["head"] == "choose":
             action = self._allowed(outputs, action_mask).argmax(-1)
             encoded = np.eye(outputs.shape[-1], dtype=np.float32)[action]

@@ -172,7 +172,7 @@ def resolve_config(
         "steps": steps,
         "seeds": tuple(seeds),
         "task_settings": task_settings,
-        "algorithm_settings": validated(learner.config_class, sections[algorithm], algorithm).model_dump(),
+        "algorithm_settings": validated(learner.config_class, sections[algorithm], algorithm).model_dump(mode="json"),
         "network": network.decided(steps, device),
         "prior": prior,
         "evaluation": validated(EvaluationConfig, sections["evaluation"], "evaluation"),
@@ -236,7 +236,7 @@ def _preset_sections(task: str, algorithm: str, preset: str, network: object) ->
 
 def resolve_task_settings(task: str, settings: Mapping[str, object]) -> dict[str, Any]:
     """Return a task's settings with its defaults; raises a UserError for an unknown one or a value out of range."""
-    return validated(task_class(task).Settings, settings, "task").model_dump()
+    return validated(task_class(task).Settings, settings, "task").model_dump(mode="json")
 
 
 def completed(config: RunConfig) -> RunConfig:

@@ -136,6 +136,12 @@ def test_the_python_file_refuses_what_does_not_fit(tmp_path: Path) -> None:
         module.step(np.zeros((3, 4)), module.initial_memory(3))
     with pytest.raises(ValueError, match=r"the memory has shape \(2, 10\)"):
         module.step(np.zeros((3, 14)), module.initial_memory(2))
+    for rows, memory, what in (
+        (np.full((3, 14), np.nan), module.initial_memory(3), "observation"),
+        (np.zeros((3, 14)), np.full((3, 10), np.inf), "memory"),
+    ):
+        with pytest.raises(ValueError, match=f"the {what} holds a number that is not finite"):
+            module.step(rows, memory)
 
 
 @needs_cc

@@ -104,6 +104,7 @@ def test_the_python_file_refuses_tables_that_do_not_fit(tmp_path: Path) -> None:
         ({"landmarks": landmarks}, "are needed"),
         ({"landmarks": landmarks, "others": own}, r"others has shape \(2, 4\), but \(2, 'K', 2\) is needed"),
         ({"landmarks": landmarks[:, :0], "others": np.zeros((2, 1, 2))}, "K > 0"),
+        ({"landmarks": landmarks, "others": np.full((2, 1, 2), np.nan)}, "others holds a number that is not finite"),
     ):
         with pytest.raises(ValueError, match=sentence):
             run(sample_of(own, sets))

@@ -261,3 +261,4 @@ def test_a_setting_that_came_later_may_have_a_default_that_is_made(monkeypatch: 
     then = resolve_config("navigation")
     monkeypatch.setattr(config_module, "task_class", lambda name: SimpleNamespace(Settings=Grown))
     assert completed(then).task_settings["places"] == [1, 2], "as JSON has it"
+    assert completed(then) == resolve_config("navigation"), "a run that is on record and one that is asked for again"
