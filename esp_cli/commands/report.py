@@ -129,7 +129,7 @@ def _refuse_trials(path: Path) -> None:
     from esp_cli.studies.kinds import TRIALS
     from esp_cli.studies.study import StudyFolder
 
-    if StudyFolder.is_one(path) and StudyFolder.open(path).study.kind == TRIALS:
+    if StudyFolder.is_one(path) and StudyFolder.open(path).study.kind.endswith(TRIALS):
         raise UserError(f"{path} holds trials; report what judges them by: esp report {shlex.quote(str(path / FRESH))}")
 
 

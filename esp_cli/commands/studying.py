@@ -108,15 +108,22 @@ def search_or_forecast(search: Search, kind: str, choices: StudyChoices) -> None
     from esp_cli.studies.study import StudyFolder
 
     out, planned, fresh = choices.folder(kind), search.trials, None
-    if choices.dry_run:
+
+    def plan() -> tuple[Trials, Study]:
+        """Plan trials and what judges them; this refuses folders that cannot take them, before anything is trained."""
         trials, _ = Trials.planned(out, planned)
         study = search.forecast(trials)
         StudyFolder.planned(out / FRESH, study, search.keeps)
+        return trials, study
+
+    if choices.dry_run:
+        trials, study = plan()
         groups = {": ".join(one): own for one, own in search.trials_of.items()}
         what = f"{len(search.draws)} trials of each, and the runs that judge"
         forecast(StudyFolder(out / FRESH, study), choices, trials, groups, what)
         return
     with working(choices, out, search.request.device) as resources:
+        plan()
         trials = Trials.create(out, planned)
         failed = follow(trials, trials.cells_of(planned), resources)
         if not (resources.requests or failed):
@@ -187,7 +194,9 @@ def run_cells(
     for cell, twin in taken:
         console.note(f"taking over {twin} as {cell.name}")
     if resources.reused and not taken and not all(folder.run_path(cell).exists() for cell in cells):
-        console.note("--reuse gives nothing: no run there is finished with the configuration and episodes of one here")
+        console.note(
+            "--reuse gives nothing: no finished run there has configuration and episodes of one that has not begun"
+        )
     failed = follow(folder, folder.unlike(cells), resources, progress)
     for cell, twin in folder.adopt_finished(cells, [folder]):
         console.note(f"taking over {twin} as {cell.name}, which trains the same")

@@ -6,7 +6,7 @@ import json
 import math
 import os
 import tomllib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -246,11 +246,14 @@ def read_table(path: str | os.PathLike[str]) -> dict[str, Any]:
     return table
 
 
-def flat(table: Mapping[str, Any], whole: Collection[str] = (), prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield dotted name and value of all in nested tables, {"a": {"b": 1}} -> ("a.b", 1), bar the `whole`."""
+def flat(table: Mapping[str, Any], dots: int | None = None, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield dotted name and value of all in nested tables, {"a": {"b": 1}} -> ("a.b", 1).
+
+    A table whose name has as many `dots` is yielded whole.
+    """
     for key, value in table.items():
         name = f"{prefix}{key}"
-        if isinstance(value, Mapping) and name not in whole:
-            yield from flat(value, whole, f"{name}.")
+        if isinstance(value, Mapping) and (dots is None or name.count(".") < dots):
+            yield from flat(value, dots, f"{name}.")
         else:
             yield name, value

@@ -110,6 +110,7 @@ class _State:
     step: int  # environment steps per seed
     curve: RunCurve | None = None  # its evaluations, if there are any yet
     final: FinalEvaluation | None = None  # of its policy, if there is one
+    stopped: bool = False  # whether it ended without a policy, since every seed stopped
     at: int | None = None  # step at which runs put together by hand are compared; None for the final evaluation
 
 
@@ -224,7 +225,8 @@ def _state(folder: StudyFolder, cell: Cell, mode: Mode) -> _State:
         if any(len(returns.per_seed) != wanted for returns in (final.greedy, final.stochastic)):
             raise UserError(f"{run} does not fit its study: its final evaluation has not the {wanted} seeds of the run")
     curve = begun_curve(run, cell, mode)
-    return _State(curve.trained if curve else read_last_row(run / METRICS).get("step", 0), curve, final)
+    step = curve.trained if curve else read_last_row(run / METRICS).get("step", 0)
+    return _State(step, curve, final, folder.has_stopped(cell))
 
 
 def _results(study: Study, states: Mapping[str, _State], mode: Mode, thresholds: Sequence[float]) -> Results:
@@ -256,6 +258,9 @@ def _cell(study: Study, cell: Cell, state: _State, mode: Mode, config: Mapping[s
         }
         if kind.network_cost:
             fields |= {"parameters": final.parameters, "flops_per_action": final.flops_per_action}
+    elif compared is not None and state.stopped:
+        none = (None,) * len(cell.config.seeds)
+        fields = {"convention": compared.spec.convention, "returns": {"greedy": none, "stochastic": none}}
     elif compared is not None and state.at is not None:
         fields = {
             "esp_version": study.esp_version,

@@ -12,6 +12,7 @@ from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.reporting.collect import read_curve
 from esp_cli.reporting.page import data_uri, draw_film, template
 from esp_cli.reporting.study_figures import Panel, learning_curves
+from esp_cli.training.metrics import RETURN
 from esp_cli.training.trackers import Row
 from esp_cli.training.trainer import Trainer
 
@@ -29,7 +30,7 @@ class LivePage:
 
     def write(self, step: int, values: Row) -> None:
         begun, complete = time.monotonic(), self._trainer.is_complete
-        if "eval/return_greedy" in values and (complete or self._spent <= SHARE * (begun - self._begun)):
+        if RETURN in values and (complete or self._spent <= SHARE * (begun - self._begun)):
             replace_file(self.path, self._page(step, complete).encode())
             self._spent += time.monotonic() - begun
 

@@ -156,7 +156,7 @@ def _outcome(material: Material) -> list[str]:
     finished = [cell for cell in results.cells if cell.summary is not None and cell.summary.returns.mean is not None]
     pairs = [(cell, other) for cell in finished if (other := results.reference_of(cell)) is not None]
     pairs = [(cell, other) for cell, other in pairs if other in finished]
-    stopped = [f"{c.variant}, {c.panel}" for c in results.cells if _has_stopped(c)]
+    stopped = [f"{c.variant}, {c.panel}" for c in results.cells if c.has_stopped]
     left_out = [f"Not compared, since a seed stopped: {'; '.join(stopped)}."] if stopped else []
     if len(pairs) == 1 and len(finished) == len(results.cells):
         both = pairs[0]
@@ -168,14 +168,9 @@ def _outcome(material: Material) -> list[str]:
     return [*texts, *left_out] or ["No run has a return yet."]
 
 
-def _has_stopped(cell: CellResult) -> bool:
-    """Whether a seed of a run has no return at the end."""
-    return any(None in values for values in cell.returns.values())
-
-
 def _ranking(panel: str, results: Results) -> str:
     """State which method of a panel is highest, and which are ahead of the reference or behind it."""
-    own = [cell for cell in results.cells if cell.panel == panel and not _has_stopped(cell)]
+    own = [cell for cell in results.cells if cell.panel == panel and not cell.has_stopped]
     cells = [(cell, cell.summary) for cell in own if cell.summary is not None]
     missing = ", ".join(cell.variant for cell in own if cell.summary is None)
     if not cells:
@@ -202,7 +197,7 @@ def _returns(results: Results, *cells: CellResult) -> str:
 
 def _verdict(cell: CellResult, other: CellResult) -> str:
     gap = None if cell.summary is None else cell.summary.gap
-    stopped = [one.variant for one in (cell, other) if _has_stopped(one)]
+    stopped = [one.variant for one in (cell, other) if one.has_stopped]
     if gap is None and stopped:
         seeds = f"a seed of {' and of '.join(stopped)} stopped"
         return f"There is no interval of the difference: {seeds}, and the others are no fair sample."
@@ -220,11 +215,16 @@ def _verdict(cell: CellResult, other: CellResult) -> str:
 def _too_few(pairs: Sequence[tuple[CellResult, CellResult]]) -> list[str]:
     """Say where the seeds are so few that the rank-sum test tells nothing apart, however large a difference is."""
     tested = [cell for cell, _ in pairs if cell.summary and cell.summary.gap and cell.summary.gap.holm is not None]
-    most = max(Counter(cell.panel for cell in tested).values(), default=0)
-    seeds = min((len(cell.seeds) for cell in tested), default=0)
-    enough = next(n for n in itertools.count() if most * 2 / math.comb(2 * n, n) <= 1 - CONFIDENCE)
-    few = f"With {seeds} seeds the rank-sum test can tell nothing apart here; take {enough} seeds or more."
-    return [few] if seeds < enough else []
+    few = dict[tuple[int, int], list[str]]()  # panels by the seeds that they have and need
+    for panel, comparisons in Counter(cell.panel for cell in tested).items():
+        seeds = min(len(cell.seeds) for cell in tested if cell.panel == panel)
+        enough = next(n for n in itertools.count() if comparisons * 2 / math.comb(2 * n, n) <= 1 - CONFIDENCE)
+        if seeds < enough:
+            few.setdefault((seeds, enough), []).append(panel)
+    return [
+        f"With {seeds} seeds the rank-sum test can tell nothing apart on {'; '.join(panels)}; take {enough} or more."
+        for (seeds, enough), panels in few.items()
+    ]
 
 
 def _steps(material: Material, cell: CellResult, other: CellResult) -> list[str]:
@@ -248,9 +248,15 @@ def _reached(results: Results, threshold: float) -> str:
     for cell in results.cells:
         of_mean = next((p.of_mean for p in cell.steps_to if math.isclose(p.threshold, threshold, abs_tol=1e-4)), None)
         name = f"{cell.variant} ({cell.panel})" if several else cell.variant
-        ended = cell.status == "finished" and (cell.at is None or cell.step >= cell.steps)
-        never = "never" if ended else f"not up to {format_count(cell.step)} steps" if cell.step else NOT_RUN
-        firsts[name] = never if of_mean is None else f"after {format_count(of_mean)} steps"
+        if of_mean is not None:
+            when = f"after {format_count(of_mean)} steps"
+        elif cell.has_stopped:
+            when = "at no step that is known, since a seed stopped"
+        elif cell.status == "finished" and (cell.at is None or cell.step >= cell.steps):
+            when = "never"
+        else:
+            when = f"not up to {format_count(cell.step)} steps" if cell.step else NOT_RUN
+        firsts[name] = when
     return f"The mean over seeds first has {threshold:g}: {', '.join(map(' '.join, firsts.items()))}."
 
 

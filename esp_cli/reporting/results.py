@@ -105,6 +105,11 @@ class CellResult(BaseModel):
     # statistics of these numbers; None before `summarised`, or where there are no returns yet
     summary: CellSummary | None = None
 
+    @property
+    def has_stopped(self) -> bool:
+        """Whether a seed has no return at the end."""
+        return any(None in values for values in self.returns.values())
+
 
 class Results(BaseModel):
     """The results of a study, finished or not."""

@@ -160,7 +160,8 @@ def steps_table(results: Results) -> Table:
     for cell in runs.values():  # of runs compared at several steps the last
         reference = results.reference_of(cell) or cell
         for passing in cell.steps_to:
-            mean = math.inf if passing.of_mean is None else passing.of_mean
+            never = math.nan if cell.has_stopped else math.inf
+            mean = never if passing.of_mean is None else passing.of_mean
             median, interval = median_steps(passing.per_seed)
             span = f"[{', '.join(_within(end, cell.step) for end in interval)}]" if interval else NOTHING
             reached = (_within(mean, cell.step), _within(median, cell.step), span)
@@ -279,6 +280,8 @@ def _share(steps: float, of: float) -> str:
 
 
 def _within(steps: float, run: int) -> str:
+    if math.isnan(steps):
+        return NOTHING
     return format_count(steps) if math.isfinite(steps) else f"> {format_count(run)}"
 
 

@@ -92,6 +92,14 @@ def refuse_other_tasks(steps: Iterable[tuple[str | None, int]], tasks: Collectio
             raise UserError(f"--steps {task}={number} concerns no run here; the tasks are {', '.join(tasks)}")
 
 
+def refuse_unused(settings: Iterable[str], sections: Collection[str]) -> None:
+    """Refuse settings of tasks or algorithms of which there is no run."""
+    for setting in settings:
+        section = setting.rpartition(".")[0]
+        if section in (*ALGORITHMS, *task_names()) and section not in sections:
+            raise UserError(f"--set {setting} concerns no run of this study; it has {', '.join(sections)}")
+
+
 def refuse_varied(settings: Iterable[str], tasks: Sequence[str], varied: Container[str]) -> None:
     """Refuse a user's setting that a study chooses itself in runs of one of the tasks."""
     for setting in settings:
@@ -202,10 +210,7 @@ def _refuse_unused(kind: StudyKind, request: Request, tasks: Sequence[str], algo
     for setting in request.breakings or ():
         if setting not in known:
             raise UserError(f"'{setting}' breaks none of these tasks here; choose from {', '.join(known)}")
-    for name in request.overrides:
-        section = name.rpartition(".")[0]
-        if section in (*ALGORITHMS, *task_names()) and section not in (*tasks, *algorithms):
-            raise UserError(f"--set {name} concerns no run of this study; it has {', '.join((*tasks, *algorithms))}")
+    refuse_unused(request.overrides, (*tasks, *algorithms))
     refuse_other_tasks(request.steps or (), tasks)
     unserved = [task for task in tasks if not _steps(kind, task, request)]
     if unserved:

@@ -12,16 +12,18 @@ from pathlib import Path
 import torch
 
 from esp_cli.files.formatting import format_count
+from esp_cli.networks.policy import Policy
 from esp_cli.studies.plan import Cell
 from esp_cli.studies.scheduler import makespan
 from esp_cli.studies.study import StudyFolder
 from esp_cli.training.build import PolicyController, build_environment, build_learner, generators, play
 from esp_cli.training.config import RunConfig
+from esp_envs.errors import UserError
 from esp_envs.registry import task_class
 
 PROBE_SECONDS = 1.0  # for which iterations of a run are timed, after a first that is not
 _LONG_SECONDS = 3.0  # an iteration that takes as long is measured once
-_PROBED_EPISODES = 8  # of an evaluation, at most; longer ones take their share more
+_PROBED_EPISODES = 8, 32  # of an evaluation; longer ones take more by the line through both
 _POLICIES = 3  # a final evaluation plays greedily, with drawn actions, at random, and with each heuristic of the task
 
 
@@ -115,6 +117,8 @@ def _cost(config: RunConfig, episodes: int, known: dict[str, Cost]) -> Cost:
 
 def measure(config: RunConfig, episodes: int) -> Cost:
     """Measure a run by some of its iterations and an evaluation, without writing anything."""
+    if config.device == "cuda" and not torch.cuda.is_available():
+        raise UserError("this machine has no GPU, so it cannot tell what runs cost on one; leave out --dry-run")
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # as the runs of a study do
     try:
@@ -130,19 +134,31 @@ def measure(config: RunConfig, episodes: int) -> Cost:
                 learner.iterate(done / iterations)
                 done += 1
             per_iteration = (clock() - begun) / done
-        side_by_side = min(config.evaluation.episodes, _PROBED_EPISODES)
-        env = build_environment(config, side_by_side, "probe")
-        clock = _clock(config)
-        begun = clock()
-        play(env, PolicyController(learner.policy, generators(config.seeds, "probe")))
-        per_episode = (clock() - begun) / side_by_side
+        playing = _playing(config, learner.policy)
     finally:
         torch.set_num_threads(threads)
     evaluations = 1 + config.steps // config.evaluation.every_steps
     return Cost(
-        training_s=iterations * per_iteration + evaluations * 2 * config.evaluation.episodes * per_episode,
-        evaluation_s=(_POLICIES + len(task_class(config.task).heuristics)) * episodes * per_episode,
+        training_s=iterations * per_iteration + evaluations * 2 * playing(config.evaluation.episodes),
+        evaluation_s=(_POLICIES + len(task_class(config.task).heuristics)) * playing(episodes),
     )
+
+
+def _playing(config: RunConfig, policy: Policy) -> Callable[[int], float]:
+    """Return by number of episodes how long a policy takes to play them, side by side."""
+    few, many = _PROBED_EPISODES
+
+    def measured(episodes: int) -> float:
+        env, clock = build_environment(config, episodes, "probe"), _clock(config)
+        begun = clock()
+        play(env, PolicyController(policy, generators(config.seeds, "probe")))
+        return clock() - begun
+
+    seconds = measured(few)
+    each = seconds / few
+    if seconds < PROBE_SECONDS:  # else the steps themselves are what takes the time
+        each = min(each, max(0.0, measured(many) - seconds) / (many - few))
+    return lambda episodes: max(0.0, seconds + (episodes - few) * each)
 
 
 def _clock(config: RunConfig) -> Callable[[], float]:

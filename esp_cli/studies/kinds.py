@@ -10,7 +10,7 @@ from esp_cli.defaults import Mode
 from esp_cli.studies import paper
 
 Settings = Mapping[str, object]  # dotted names of settings -> values
-TRIALS = "symmetry-trials"  # the kind of study that holds the trials of a search
+TRIALS = "-trials"  # how the kind of a study ends that holds the trials of a search
 GROUP = "<group>"  # stands for the group that the user chooses
 ALGORITHMS = ("maddpg", "qmix", "mappo")  # in the order of the paper's table
 PAPER_PRIOR: Settings = {"prior.transforms": "rot90", "prior.consistency_coef": 0.5}

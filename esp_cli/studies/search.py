@@ -9,7 +9,7 @@ Layout of its folder::
 
 from __future__ import annotations
 
-import json
+import contextlib
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,26 +18,29 @@ from pathlib import Path
 from typing import ClassVar, Self
 
 import numpy as np
+from pydantic import BaseModel, JsonValue
 
+from esp_cli.files.documents import MAX_DOCUMENT_BYTES, parse_object, validate
+from esp_cli.files.opening import read_regular
 from esp_cli.files.writing import replace_file
 from esp_cli.studies.catalogue import Request
 from esp_cli.studies.kinds import TRIALS
 from esp_cli.studies.plan import Cell, Study
 from esp_cli.studies.study import StudyFolder
 from esp_cli.training.folder_names import FRESH, METRICS
-from esp_cli.training.metrics import column, read_last_row, read_metrics
+from esp_cli.training.metrics import RETURN, column, read_metrics
 from esp_envs.errors import UserError
 
 FIRST_TRIAL_SEED = 100  # further trial seeds follow it
+_SCORES = "trials.json"
 _SCORED = 2  # greedy evaluations at the end of a trial whose mean is its score
-_RETURN = "eval/return_greedy"
 
 Candidate = tuple[str, str]  # the name of its task, and its own
 
 
 def score(run: Path) -> float:
     """Return the mean of a trial's last two greedy evaluations over its seeds, -inf where one is not finite."""
-    _, returns = column(read_metrics(run / METRICS), _RETURN)
+    _, returns = column(read_metrics(run / METRICS), RETURN)
     return float(np.nan_to_num(returns[-_SCORED:], nan=-np.inf).mean())
 
 
@@ -45,9 +48,8 @@ class Trials(StudyFolder):
     """The trials of a search: runs without a final evaluation, in whose folder `fresh` is the study that judges."""
 
     def is_finished(self, cell: Cell) -> bool:
-        """Return whether a trial is trained, or has ended without a policy since every seed stopped."""
-        last = read_last_row(self.run_path(cell) / METRICS).get(_RETURN)
-        return self.is_trained(cell) or (isinstance(last, list) and all(value is None for value in last))
+        """Return whether a trial has ended."""
+        return self.is_trained(cell) or self.has_stopped(cell)
 
     @classmethod
     def planned(cls, path: Path, study: Study, keep: bool = True) -> tuple[Self, bool]:
@@ -61,6 +63,14 @@ class Trials(StudyFolder):
                         f"{path / FRESH} has judged {judged} already; keep its --budget, or choose another --out"
                     )
         return super().planned(path, study, keep)
+
+
+class Scores(BaseModel):
+    """What trials came to."""
+
+    draws: tuple[dict[str, JsonValue], ...]  # settings that were tried
+    seeds: tuple[int, ...]  # of each trial
+    scores: dict[str, list[float | None]]  # by "TASK: CANDIDATE" of its trials; None where a seed stopped
 
 
 class Search(ABC):
@@ -108,7 +118,8 @@ class Search(ABC):
     @property
     def trials(self) -> Study:
         """The plan of all trials."""
-        return self._study(TRIALS, self.title, sum(self.trials_of.values(), list[Cell]()), self.left_out)
+        cells = sum(self.trials_of.values(), list[Cell]())
+        return self._study(self.judges[0] + TRIALS, self.title, cells, self.left_out)
 
     def forecast(self, trials: Trials) -> Study:
         """Plan the runs that judge; for a candidate with trials to do, its last draw stands in for the best."""
@@ -124,11 +135,16 @@ class Search(ABC):
         return self._judged(trials, best)
 
     def record(self, path: Path, scores: Mapping[Candidate, Sequence[float]], best: Mapping[Candidate, int]) -> None:
-        """Write the draws and all scores into the folder of the search."""
+        """Write the draws and all scores into the folder of the search, those of candidates of earlier calls too."""
         finite = {one: [value if math.isfinite(value) else None for value in own] for one, own in scores.items()}
         named = {": ".join(one): own for one, own in finite.items()}
-        document = {"draws": self.draws, "seeds": self.trial_seeds, "scores": named}
-        replace_file(path / "trials.json", (json.dumps(document, indent=1) + "\n").encode())
+        found, file = Scores(draws=tuple(map(dict, self.draws)), seeds=self.trial_seeds, scores=named), path / _SCORES
+        with contextlib.suppress(OSError, UserError):
+            known = validate(Scores, parse_object(read_regular(file, MAX_DOCUMENT_BYTES) or b"", "text"))
+            if all(one == other for one, other in zip(known.draws, found.draws, strict=False)):
+                draws = max(known.draws, found.draws, key=len)
+                found = Scores(draws=draws, seeds=found.seeds, scores=known.scores | found.scores)
+        replace_file(file, (found.model_dump_json(indent=1) + "\n").encode())
 
     def _judged(self, trials: Trials, best: Mapping[Candidate, int]) -> Study:
         if not best:

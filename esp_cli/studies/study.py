@@ -27,7 +27,7 @@ from esp_cli.policies.evaluation import FinalEvaluation
 from esp_cli.studies.plan import STUDY_FORMAT, Cell, Study
 from esp_cli.training.config import RunConfig, completed
 from esp_cli.training.folder_names import CONFIG, FINAL, FRESH, LOCK, LOG, METRICS, POLICY, RUNS, STUDY, STUDY_LOCK
-from esp_cli.training.metrics import elapsed_s, read_last_row
+from esp_cli.training.metrics import RETURN, elapsed_s, read_last_row
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.settings import parse_config
 from esp_envs.errors import UserError
@@ -136,11 +136,15 @@ class StudyFolder:
             for cell in there.cells
             if keep and cell.name not in wanted
         )
-        if {cell.name: cell for cell in (*study.cells, *rest)} == known:
+        cells = study.cells + rest
+        found = {f"{cell.panel.partition(', ')[0]}: {cell.variant}" for cell in cells}
+        earlier = {name: why for name, why in there.left_out.items() if keep and name not in found}
+        left_out = earlier | study.left_out
+        if {cell.name: cell for cell in cells} == known and left_out == there.left_out:
             return cls(path, there), False
         commands = [*there.command.splitlines(), study.command] if rest else [study.command]
-        merged: dict[str, object] = {"cells": study.cells + rest, "command": "\n".join(dict.fromkeys(commands))}
-        merged |= {"left_out": there.left_out | study.left_out}
+        command = "\n".join(dict.fromkeys(commands))
+        merged: dict[str, object] = {"cells": cells, "command": command, "left_out": left_out}
         return cls(path, study.model_copy(update=merged)), True
 
     @classmethod
@@ -188,8 +192,14 @@ class StudyFolder:
         """Return whether a cell's training is done; the policy file is the last that a run writes."""
         return (self.run_path(cell) / POLICY).is_file()
 
+    def has_stopped(self, cell: Cell) -> bool:
+        """Return whether a cell's training ended without a policy, since every seed stopped."""
+        last = read_last_row(self.run_path(cell) / METRICS).get(RETURN)
+        return isinstance(last, list) and all(value is None for value in last)
+
     def is_finished(self, cell: Cell) -> bool:
-        return self.is_trained(cell) and read_evaluation(self.run_path(cell)) is not None
+        """Return whether a cell has ended: its policy is evaluated, or every seed stopped."""
+        return self.has_stopped(cell) or (self.is_trained(cell) and read_evaluation(self.run_path(cell)) is not None)
 
     def next_command(self, cell: Cell) -> list[str]:
         """Return the arguments that train a cell, or that evaluate it once it is trained."""
@@ -233,13 +243,18 @@ class StudyFolder:
             if theirs.config == cell.config and other.is_finished(theirs)
         )
         finals = ((path, read_evaluation(path)) for path in alike)
-        return next((path for path, one in finals if one and one.task_version == _task_version(cell.config)), None)
+        version = _task_version(cell.config)
+        return next((path for path, one in finals if one is None or one.task_version == version), None)
 
     def adopt(self, cell: Cell, twin: Path) -> None:
         """Take a finished run over as this cell's, without links, which bring in files from anywhere; its log tells."""
         part = self.path / RUNS / f".{cell.name}.part"
         shutil.rmtree(part, ignore_errors=True)  # what a kill left
-        shutil.copytree(twin, part, ignore=lambda folder, names: [n for n in names if Path(folder, n).is_symlink()])
+        try:
+            shutil.copytree(twin, part, ignore=lambda folder, names: [n for n in names if Path(folder, n).is_symlink()])
+        except shutil.Error as error:  # of several files; the first tells, as where the disk is full
+            shutil.rmtree(part, ignore_errors=True)
+            raise UserError(f"{twin} cannot be copied to {self.run_path(cell)}: {error.args[0][0][2]}") from None
         with os.fdopen(open_own(part / LOG, os.O_WRONLY | os.O_APPEND), "a", encoding="utf-8") as log:
             log.write(f"taken over from {twin}\n")
         part.rename(self.run_path(cell))

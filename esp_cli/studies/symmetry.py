@@ -11,7 +11,14 @@ from dataclasses import dataclass, field, replace
 
 from esp_cli.checking.measured import planned
 from esp_cli.files.formatting import file_name, format_exactly
-from esp_cli.studies.catalogue import Request, refuse_other_tasks, refuse_unknown_or_twice, refuse_varied, settings_of
+from esp_cli.studies.catalogue import (
+    Request,
+    refuse_other_tasks,
+    refuse_unknown_or_twice,
+    refuse_unused,
+    refuse_varied,
+    settings_of,
+)
 from esp_cli.studies.kinds import KINDS, Settings
 from esp_cli.studies.plan import Cell
 from esp_cli.studies.search import FIRST_TRIAL_SEED, Candidate, Search
@@ -131,6 +138,8 @@ class Benchmark(Search):
         for board in self.boards.values():
             varied = own | {name for name in board.settings if name.startswith("task.")}
             refuse_varied(self.request.overrides, [board.task], varied)
+        tasks = dict.fromkeys(board.task for board in self.boards.values())
+        refuse_unused(self.request.overrides, (*tasks, self.algorithm))
         refuse_other_tasks(self.request.steps or (), self.boards)
 
     def _taken(self) -> Iterator[Candidate]:

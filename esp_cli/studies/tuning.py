@@ -119,6 +119,8 @@ class Tuning(Search):
     def _draws(self, budget: int) -> list[dict[str, object]]:
         """Return the default settings, and then those drawn that go together and are new."""
         generator, found, tried = random.Random(0), list[dict[str, object]]([{}]), count(1)
+        for prior in self.priors:
+            build_learner(self.config(prior, {}, self.trial_seeds).of_one_seed())
         while len(found) < budget and next(tried) <= _TRIES * budget:
             settings = dict[str, object](drawn(self.space, generator))
             try:

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Value = float | None | list[float | None] | Tensor
 """What a row may hold under a name: a number, or one per seed; None where there is none, as for a stopped seed."""
+RETURN = "eval/return_greedy"  # name of the returns of greedy evaluations
 _MAX_LINE_BYTES = 16 * 2**20  # what is longer was not written by this program
 _TAIL_BYTES = 2**18  # longer than most lines
 

@@ -171,7 +171,7 @@ def read_config_file(path: Path) -> ConfigFile:
     if "format" in table:
         return _of_run(path, parse_config(read_run_config(path)[0], path))
     choices, settings = {}, {}
-    for name, value in flat(table, whole=("prior.weights",)):
+    for name, value in flat(table, dots=1):
         if name in CHOICES:
             choices[name] = value
         elif "." in name:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from esp_cli.training.settings import parse_config
+from esp_cli.training.settings import parse_config, read_config_file
 from tests.cli.running import printed, refused, stored_config, written
 
 
@@ -53,6 +53,11 @@ def test_weights_of_elements_are_a_value_in_a_small_file(tmp_path: Path) -> None
     prior = {"transforms": "rot90,rot180", "trust": "measured", "weights": {"rot90": 0.5, "rot180": 1.0}}
     small = written(tmp_path / "c.json", {"task": "navigation", "prior": prior})
     assert printed("--config", small)["prior"]["weights"] == prior["weights"]
+
+
+def test_a_setting_that_is_a_table_is_read_whole(tmp_path: Path) -> None:
+    file = written(tmp_path / "nested.json", {"task": {"table": {"x": {}}}, "prior.weights": {"rot90": 1.0}})
+    assert read_config_file(file).settings == {"task.table": {"x": {}}, "prior.weights": {"rot90": 1.0}}
 
 
 def test_printing_makes_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

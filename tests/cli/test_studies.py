@@ -100,7 +100,7 @@ def test_a_study_runs_from_a_command_to_a_page_and_a_small_file(tmp_path: Path) 
     assert "2 runs, 2 of them finished" in taken.stderr
     assert "--reuse gives nothing" not in esp(*copied).stderr, "all is there"
     fewer = [*TINY[:-1], 2, "--steps", 100, *TINY_OPTIONS, "--out", tmp_path / "fewer", "--reuse", out]
-    assert "--reuse gives nothing: no run there" in esp(*fewer).stderr
+    assert "--reuse gives nothing: no finished run there" in esp(*fewer).stderr
     small = tmp_path / "small.json"
     report = esp("report", out, "--films", "--results", small)
     assert [cell.pop("summary")["returns"]["per_seed"] for cell in results["cells"]] == [

@@ -72,6 +72,8 @@ def test_a_search_goes_from_a_command_to_a_preset_and_a_study_on_fresh_seeds(com
     first, *rest = (run["status"] for run in more["runs"])
     assert (first, set(rest)) == ("2 of 3 finished", {"finished", "new"})
     assert "holds another study (esp-000 has other seeds or settings)" in refused(*words, "--trial-seeds", 2)
+    assert "holds another study (esp-default has other seeds" in refused(*words, "--budget", 3, "--seeds", 3)
+    assert len(StudyFolder.open(out).study.cells) == 2, "nothing is tried first"
     again = esp(*words)
     assert "2 runs, 2 of them finished" in again.stderr
     assert f"report what judges them by: esp report {out / 'fresh'}" in refused("report", out)

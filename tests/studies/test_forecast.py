@@ -11,6 +11,8 @@ from esp_cli.studies.forecast import Cost, forecast_tuned
 from esp_cli.studies.forecast import forecast_study as forecast
 from esp_cli.studies.search import Trials
 from esp_cli.studies.study import StudyFolder
+from esp_cli.training.build import build_learner
+from esp_envs.errors import UserError
 from tests.studies.small_studies import small_study, write_run
 from tests.studies.test_tuning import tuning
 from tests.training.runs import tiny_config
@@ -96,11 +98,30 @@ def test_twice_the_steps_cost_about_twice_the_iterations_and_evaluations(monkeyp
     ticks = iter(range(10**6))
     monkeypatch.setattr(module.time, "process_time", lambda: float(next(ticks)))
     one, two = module.measure(tiny_config(steps=1000), 4), module.measure(tiny_config(steps=2000), 4)
-    # 20 and 40 iterations; 11 and 21 evaluations of 2 x 2 episodes; an episode takes half a tick
-    iteration = (two.training_s - one.training_s - 10 * 4 * 0.5) / 20
-    assert one.training_s == pytest.approx(20 * iteration + 11 * 4 * 0.5)
+    # 20 and 40 iterations; 11 and 21 evaluations of two episodes twice; eight episodes take a tick, two a quarter
+    iteration = (two.training_s - one.training_s - 10 * 2 * 0.25) / 20
+    assert one.training_s == pytest.approx(20 * iteration + 11 * 2 * 0.25)
     # greedy, drawn, random, and the three heuristics of navigation, four episodes each
-    assert one.evaluation_s == two.evaluation_s == 6 * 4 * 0.5
+    assert one.evaluation_s == two.evaluation_s == 6 * 0.5
+
+
+@pytest.mark.parametrize(("fixed", "each", "longer"), [(0.1, 0.01, 0.1 + 320 * 0.01), (4.0, 0.5, 8.0 + 312 * 1.0)])
+def test_episodes_played_side_by_side_share_their_steps(monkeypatch, fixed, each, longer):
+    """Eight episodes take 0.18 s and 32 take 0.42 s; where eight take 8 s, the rest is taken to cost as much each."""
+    now = [0.0]
+    monkeypatch.setattr(module, "PROBE_SECONDS", 1.0)
+    monkeypatch.setattr(module, "play", lambda env, _: now.__setitem__(0, now[0] + fixed + each * env.num_envs))
+    monkeypatch.setattr(module, "_clock", lambda config: lambda: now[0])
+    config = tiny_config()
+    playing = module._playing(config, build_learner(config).policy)
+    assert playing(8) == pytest.approx(fixed + 8 * each)
+    assert playing(320) == pytest.approx(longer)
+
+
+def test_a_gpu_that_is_not_here_is_not_measured(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(UserError, match="this machine has no GPU"):
+        module.measure(tiny_config().model_copy(update={"device": "cuda"}), 4)
 
 
 def test_other_work_on_the_machine_costs_a_run_nothing(monkeypatch):

@@ -1,17 +1,21 @@
 """Study folders: plain files, gone on with, extended, and never written over."""
 
 import json
+import shutil
 import sys
 
 import pytest
 
 from esp_cli.files.opening import is_held
 from esp_cli.files.writing import TEMPORARY_PREFIX
+from esp_cli.reporting.collect import collect_study
+from esp_cli.reporting.page import answer
+from esp_cli.reporting.tables import TABLES
 from esp_cli.studies.engine import LocalEngine
 from esp_cli.studies.study import StudyFolder, read_evaluation
 from esp_cli.training.folder_names import FINAL, LOG
 from esp_envs.errors import UserError
-from tests.studies.small_studies import small_study, write_study
+from tests.studies.small_studies import small_study, write_run, write_study
 
 ENDS = {"MAPPO": [-120.0, -121.0, -122.0]}
 
@@ -162,6 +166,28 @@ def test_finished_is_trained_and_evaluated(tmp_path):
     assert read_evaluation(folder.run_path(esp)) is None
 
 
+def test_a_run_whose_seeds_all_stopped_has_ended_and_is_reported(tmp_path):
+    folder = write_study(tmp_path / "s", small_study(), {})
+    plain, esp = folder.study.cells
+    write_run(folder, plain, [[-200.0] * 3, [-150.0] * 3], [-150.0] * 3)
+    write_run(folder, esp, [[-200.0] * 3, [-180.0, None, -190.0]], [-1.0] * 3)
+    (folder.run_path(esp) / "policy.safetensors").unlink()
+    assert not folder.is_finished(esp), "one seed goes on"
+    with (folder.run_path(esp) / "metrics.jsonl").open("a") as metrics:
+        metrics.write('{"step": 150, "eval/return_greedy": [null, null, null]}\n')
+    assert folder.is_finished(esp)
+    (folder.run_path(esp) / FINAL).unlink()
+    assert folder.is_finished(esp), "there is no policy to evaluate"
+    material = collect_study(folder, thresholds=[-170.0])
+    assert material.results.cells[1].status == "finished"
+    *_, left_out, reached = answer(material, [-170.0])
+    assert left_out == "Not compared, since a seed stopped: MAPPO-ESP, navigation, 200."
+    assert reached.endswith("MAPPO after 100 steps, MAPPO-ESP at no step that is known, since a seed stopped.")
+    assert [row[3] for row in TABLES["steps"](material.results).rows] == ["100", "-"]
+    other = StudyFolder.create(tmp_path / "t", small_study())
+    assert other.find_twin(esp, [folder]) == folder.run_path(esp), "another study need not try it again"
+
+
 def test_a_run_of_another_configuration_is_not_gone_on_with(tmp_path):
     folder = write_study(tmp_path / "s", small_study(), ENDS)
     file = folder.run_path(folder.study.cells[0]) / "config.json"
@@ -183,6 +209,20 @@ def test_a_finished_run_of_the_same_configuration_is_taken_over_from_another_stu
     assert (folder.run_path(plain) / LOG).read_text().endswith(f"taken over from {twin}\n")
     assert folder.find_twin(plain, [other]) is None, "it is there now"
     assert sorted(path.name for path in folder.run_path(plain).parent.iterdir()) == [plain.name]
+
+
+def test_a_run_that_cannot_be_copied_is_one_sentence_and_leaves_nothing(tmp_path, monkeypatch):
+    other = write_study(tmp_path / "other", small_study(), ENDS)
+    folder = StudyFolder.create(tmp_path / "s", small_study())
+
+    def copytree(source, part, ignore):
+        part.mkdir(parents=True)
+        raise shutil.Error([(str(source), str(part), "[Errno 28] No space left on device")])
+
+    monkeypatch.setattr(shutil, "copytree", copytree)
+    with pytest.raises(UserError, match=r"cannot be copied to .*: \[Errno 28\] No space left on device"):
+        folder.adopt_finished(folder.study.cells, [other])
+    assert not any((folder.path / "runs").iterdir())
 
 
 def test_a_run_of_another_version_of_the_task_is_no_twin_and_its_study_does_not_go_on(tmp_path):

@@ -114,6 +114,36 @@ def test_the_best_trial_is_judged_and_the_first_of_equal_ones(tmp_path: Path) ->
     }
 
 
+def test_scores_of_methods_that_were_tried_before_stay_on_file(tmp_path: Path) -> None:
+    for methods, budget in ((("plain", "ESP"), 2), (("copies",), 3)):
+        asked = benchmark(variants=methods, budget=budget)
+        asked.judged(write_trials(tmp_path / "s", asked, {}))
+    found = json.loads((tmp_path / "s" / "trials.json").read_text())
+    assert {name: len(own) for name, own in found["scores"].items()} == {
+        "navigation: plain": 2,
+        "navigation: ESP": 2,
+        "navigation: copies": 3,
+    }
+    assert len(found["draws"]) == 3
+    (tmp_path / "s" / "trials.json").write_text('{"draws": 7, "scores": []}')
+    asked.judged(Trials.open(tmp_path / "s"))
+    assert json.loads((tmp_path / "s" / "trials.json").read_text())["scores"].keys() == {"navigation: copies"}
+
+
+def test_why_a_method_is_left_out_is_on_file_until_it_is_judged(tmp_path: Path) -> None:
+    first = benchmark(variants=("plain",), tasks=("wildlife",), budget=1)
+    folder = Trials.create(tmp_path / "s", first.trials)
+    more = benchmark(variants=("plain", "local frames"), tasks=("wildlife",), budget=1)
+    assert folder.study.left_out == {}
+    left_out = Trials.create(tmp_path / "s", more.trials).study.left_out
+    assert list(left_out) == ["wildlife: local frames"], "though it adds no run"
+    judged = benchmark(variants=("plain", "ESP"), budget=1)
+    study = judged.judged(write_trials(tmp_path / "t", judged, {"navigation-200k-esp-0": math.nan}))
+    assert list(StudyFolder.create(tmp_path / "f", study).study.left_out) == ["navigation: ESP"]
+    again = judged.judged(write_trials(tmp_path / "t", judged, {}))
+    assert StudyFolder.create(tmp_path / "f", again).study.left_out == {}
+
+
 def test_a_trial_whose_seeds_all_stopped_has_ended_and_a_method_of_such_trials_is_left_out(tmp_path: Path) -> None:
     asked = benchmark(variants=("plain", "ESP", "copies"), budget=2)
     ends = {f"navigation-200k-{stopped}": math.nan for stopped in ("plain-0", "plain-1", "esp-0")}
@@ -155,6 +185,8 @@ def test_what_is_judged_gets_no_further_trials_but_other_methods_do(tmp_path: Pa
         ),
         ({"overrides": {"mappo.lr": 1}}, "unknown setting 'mappo.lr'"),
         ({"tasks": ("navigation", "chess")}, "unknown task 'chess'"),
+        ({"overrides": {"qmix.learning_rate": 0.5}}, "--set qmix.learning_rate concerns no run of this study; it has "),
+        ({"overrides": {"formation.no_such": 1}}, "--set formation.no_such concerns no run of this study"),
         ({"steps": (("formation", 1000),)}, "--steps formation=1000 concerns no run here; the tasks are "),
         ({"steps": ((None, 100), (None, 200))}, "--steps gives navigation several numbers"),
     ],
@@ -180,7 +212,7 @@ def test_the_report_corrects_for_the_number_of_methods(tmp_path: Path) -> None:
     assert answer(material) == [
         "navigation, 200k: ESP has the highest IQM, -148.50; after Holm's correction, not told apart from plain: ESP, "
         "copies.",
-        "With 4 seeds the rank-sum test can tell nothing apart here; take 5 seeds or more.",
+        "With 4 seeds the rank-sum test can tell nothing apart on navigation, 200k; take 5 or more.",
     ]
     table = TABLES["comparison"](material.results)
     row = dict(zip(table.headings, table.rows[1], strict=True))
@@ -192,6 +224,20 @@ def test_the_report_corrects_for_the_number_of_methods(tmp_path: Path) -> None:
     assert not any("take" in text for text in steps)
     (folder.run_path(folder.study.cells[2]) / FINAL).unlink()
     assert answer(collect_study(folder))[0].endswith(", better than plain: ESP; not finished: copies.")
+
+
+def test_only_panels_with_too_few_seeds_for_their_comparisons_are_named(tmp_path: Path) -> None:
+    """Two comparisons of four seeds need 5, and one needs 4."""
+    choice = {"overrides": TINY | {"evaluation.every_steps": 10}, "budget": 1, "tasks": ("navigation", "wildlife")}
+    asked = benchmark(variants=("plain", "ESP", "local frames"), **choice)
+    assert [name for name, _ in asked.candidates].count("wildlife") == 2, "its pictures have no local frames"
+    folder = StudyFolder.create(tmp_path / "fresh", asked.judged(write_trials(tmp_path / "s", asked, {})))
+    for cell in folder.study.cells:
+        finals = [-180.0 + 30.0 * (cell.reference is not None) + k for k in range(4)]
+        write_run(folder, cell, [[-200.0] * 4, finals], finals)
+    *_, few = answer(collect_study(folder))
+    assert few == "With 4 seeds the rank-sum test can tell nothing apart on navigation, 200k; take 5 or more."
+    assert "better than plain: ESP" in answer(collect_study(folder))[1]
 
 
 def test_another_learner_has_its_own_space_and_trials_as_long_as_what_judges() -> None:

@@ -12,7 +12,7 @@ from esp_cli.studies.search import Trials
 from esp_cli.studies.space import Dimension, default_space, drawn, read_space
 from esp_cli.studies.tuning import Tuning
 from esp_envs.errors import UserError
-from tests.studies.test_symmetry import write_trials
+from tests.studies.test_symmetry import benchmark, write_trials
 from tests.training.runs import TINY
 
 SPACE = {"mappo.learning_rate": Dimension(low=1e-4, high=1e-1, log=True), "mappo.gamma": Dimension(choices=(0.9, 0.99))}
@@ -73,6 +73,12 @@ def test_settings_that_do_not_go_together_and_repeated_ones_are_drawn_again():
     assert sorted(one.get("mappo.num_minibatches", 0) for one in asked.draws) == [0, 1, 2]
     assert all("num_minibatches" in reason for reason in asked.refused)
     assert asked.refused
+
+
+def test_defaults_that_cannot_be_trained_are_refused_before_the_draws():
+    space = {"maddpg.num_envs": Dimension(choices=(4,))}
+    with pytest.raises(UserError, match="one round brings 8 episodes"):
+        tuning(algorithms=("maddpg",), space=space, overrides={"network.name": "mlp", "maddpg.replay_episodes": 4})
 
 
 def test_an_algorithm_without_a_space_asks_for_one():
@@ -214,6 +220,8 @@ def test_the_best_settings_are_written_for_training_and_all_scores_are_on_file(t
 def test_a_longer_search_goes_on_in_its_folder_and_one_in_another_space_does_not(tmp_path):
     write_trials(tmp_path / "s", tuning(), {})
     assert len(Trials.create(tmp_path / "s", tuning(budget=5).trials).study.cells) == 10
+    with pytest.raises(UserError, match="holds another study"):
+        Trials.create(tmp_path / "s", benchmark().trials)
     other = tuning(space={"mappo.gamma": Dimension(low=0.5, high=0.6)})
     with pytest.raises(UserError, match=r"holds another study .esp-001 has other seeds or settings"):
         Trials.create(tmp_path / "s", other.trials)
