@@ -50,6 +50,8 @@ def tune(
     if len(tuning.draws) < budget:
         console.note(f"the space holds no more than {len(tuning.draws)} trials, the default settings included")
     studying.search_or_forecast(tuning, "tune", choices)
+    for hint in tuning.hints:
+        console.note(hint)
     if not choices.dry_run:
         own = tuning.config("none", {}, tuning.trial_seeds).own_words()
         for one in tuning.priors:

@@ -15,6 +15,8 @@ from esp_cli.files.formatting import did_you_mean
 from esp_cli.prior.config import of_no_use_to
 from esp_envs.errors import UserError
 
+_END = 0.05  # share of a range at each end that counts as the end
+
 
 class Dimension(Strict):
     """What is tried of one setting: a range from `low` to `high`, or `choices`."""
@@ -55,6 +57,21 @@ class Dimension(Strict):
         assert self.high is not None
         between = () if self.is_whole else (self.low + (self.high - self.low) / math.e,)
         return (self.low, *between, self.high)
+
+    def is_at_end(self, value: object) -> bool:
+        """Return whether better values may lie beyond what is tried, since this is among the first or last of it.
+
+        Of choices in order the first or last of three and more, of a range the outermost twentieths; names have no end.
+
+        >>> Dimension(low=1e-4, high=1e-2, log=True).is_at_end(9e-3), Dimension(choices=(5, 10, 15)).is_at_end(10)
+        (True, False)
+        """
+        if self.choices is not None:
+            ordered = len(self.choices) > 2 and not any(isinstance(x, str | bool) for x in self.choices)
+            return ordered and value in (self.choices[0], self.choices[-1])
+        assert isinstance(value, int | float)
+        low, at, high = (math.log(float(x)) if self.log else float(x) for x in (self.low or 0, value, self.high or 0))
+        return not _END <= (at - low) / (high - low) <= 1 - _END
 
     def draw(self, generator: random.Random) -> JsonValue:
         """Draw a value, each equally likely; of a logarithmic range, each order of magnitude."""

@@ -31,6 +31,7 @@ class Tuning(Search):
     Attributes:
         refused: why draws were left out, one text each: their settings do not go together.
         idle: settings that change nothing with any of the priors.
+        hints: what the best trials tell of the space, one text each.
     """
 
     title = "Trials of a tuning"
@@ -54,7 +55,7 @@ class Tuning(Search):
         self.candidates, self.left_out = tuple((self.task, NAMES[prior]) for prior in priors), {}
         self.space = self._chosen(space)
         self._check()
-        self.refused = list[str]()
+        self.refused, self.hints = list[str](), list[str]()
         self.draws = self._draws(budget)
 
     def config(self, prior: str, settings: Mapping[str, object], seeds: Sequence[int]) -> RunConfig:
@@ -178,3 +179,9 @@ class Tuning(Search):
                 whole = {"task": self.task, "algorithm": self.algorithm, "preset": self.request.preset}
                 document = {**whole, "steps": self.steps, **self.overrides, "prior.kind": prior, **own}
                 replace_file(path / f"preset-{prior}.json", (json.dumps(document, indent=2) + "\n").encode())
+                ends = [f"{name} {value}" for name, value in own.items() if self.space[name].is_at_end(value)]
+                if ends:
+                    self.hints.append(
+                        f"the best of {NAMES[prior]} lies at an end of what was tried: {', '.join(ends)}; a wider "
+                        "--space may hold a better one"
+                    )

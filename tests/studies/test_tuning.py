@@ -217,6 +217,32 @@ def test_the_best_settings_are_written_for_training_and_all_scores_are_on_file(t
     assert (trials["draws"], trials["seeds"]) == (asked.draws, [100, 101])
 
 
+@pytest.mark.parametrize(
+    ("dimension", "ends", "inside"),
+    [
+        (Dimension(low=0.0, high=10.0), (0.0, 0.4, 9.6), (0.6, 5.0, 9.4)),
+        (Dimension(low=1e-4, high=1.0, log=True), (1.5e-4, 0.7), (1.7e-4, 0.01, 0.6)),  # ends at 1.58e-4 and 0.631
+        (Dimension(low=3, high=16), (3, 16), (4, 15)),
+        (Dimension(choices=(64, 128, 256)), (64, 256), (128,)),
+        (Dimension(choices=([32, 32], [64, 64], [128, 128])), ([32, 32], [128, 128]), ([64, 64],)),
+        (Dimension(choices=("c4", "d4", "d8")), (), ("c4", "d8")),
+        (Dimension(choices=(0.9, 0.99)), (), (0.9, 0.99)),
+    ],
+)
+def test_what_lies_at_an_end_by_hand(dimension, ends, inside):
+    assert [dimension.is_at_end(value) for value in (*ends, *inside)] == [True] * len(ends) + [False] * len(inside)
+
+
+def test_a_best_trial_at_an_end_of_the_space_is_told(tmp_path):
+    space = {"mappo.num_epochs": Dimension(choices=(3, 5, 8)), "mappo.gamma": Dimension(low=0.9, high=1.0)}
+    asked = tuning(space=space, budget=8, overrides={"network.name": "mlp"})
+    number = next(k for k, draw in enumerate(asked.draws) if draw.get("mappo.num_epochs") == 8)
+    asked.judged(write_trials(tmp_path / "s", asked, {f"esp-{number:03d}": 5.0}))
+    (hint,) = asked.hints
+    assert hint.startswith("the best of ESP lies at an end of what was tried: mappo.num_epochs 8")
+    assert "plain" not in hint, "whose best is the default"
+
+
 def test_a_longer_search_goes_on_in_its_folder_and_one_in_another_space_does_not(tmp_path):
     write_trials(tmp_path / "s", tuning(), {})
     assert len(Trials.create(tmp_path / "s", tuning(budget=5).trials).study.cells) == 10
