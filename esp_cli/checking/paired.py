@@ -36,6 +36,7 @@ _SOME, _FOLLOWED = 8, 4
 """Of more elements than `_SOME`, each is first tried in one of so many states; later steps are those of `_FOLLOWED`."""
 _FURTHER = "holds where play went, but further out {} would differ"
 _TOGETHER = "fields together"
+_UNMOVED = "it moves nothing in the states that play visits"
 _HIDDEN = "the state leaves out {}, and later steps do not tell what that does"
 _LATER, _LATER_OF_SLOW = 128, 32
 """Steps that are followed from an episode's start, for what builds up that no state holds, or until an end is found;
@@ -194,7 +195,13 @@ class _Pairs:
         except (Exception, SystemExit) as error:
             reason = f"the task raises in the transformed states: {type(error).__name__}: {error}"
             return ElementVerdict(element.name, declared, (), reason)
-        return ElementVerdict(element.name, declared, tuple(merged(verdicts)))
+        found = ElementVerdict(element.name, declared, tuple(merged(verdicts)))
+        moves = any(
+            not torch.equal(moved, own)
+            for state, action in self._visited
+            for moved, own in ((transform.state(state), state), (transform.action(action), action))
+        )
+        return found if moves or found.outcome != "holds" else replace(found, fields=(), reason=_UNMOVED)
 
     def broken_later(self, element: Element | Shift) -> tuple[FieldVerdict, ...] | None:
         """Return fields that are broken in so many states that rounding, which grows, is no reason.

@@ -86,7 +86,9 @@ def check(
         names = "--transforms, --policy, --algo and --network"
         raise UserError(f"{names} belong to 'esp check symmetry'; leave them out")
     options.register_named([task], algo, network)
-    chosen = resolve_task_settings(task, options.parse_task_settings(settings or []))
+    asked = options.parse_task_settings(settings or [])
+    chosen = resolve_task_settings(task, asked)
+    options.note_idle_settings(task, asked, chosen)
     make_worlds = partial(make, task, settings=chosen)
     spec = make_worlds(1, [0]).spec  # a mistake in task or settings is the user's, not a broken promise
     if what == "task":
@@ -142,6 +144,7 @@ def _check_roles(
 ) -> int:
     """Check the symmetry of each role, while all others act at random."""
     from esp_cli.checking import check_symmetry
+    from esp_cli.checking.candidates import NothingToTry
     from esp_envs.roles import without_agents
     from esp_envs.views import worlds_of_role
 
@@ -150,10 +153,15 @@ def _check_roles(
         asked = transforms if transforms is None or role.num_agents > 1 else without_agents(transforms)
         if asked == "":
             continue
-        with console.watching("check", "elements") as watch:
-            make = worlds_of_role(make_worlds, role.name)
-            rest = until - time.monotonic()
-            reports[role.name] = check_symmetry(make, asked, watch=watch, seconds=rest, spare=rest / (2 * left - 1))
+        try:
+            with console.watching("check", "elements") as watch:
+                make = worlds_of_role(make_worlds, role.name)
+                rest = until - time.monotonic()
+                reports[role.name] = check_symmetry(make, asked, watch=watch, seconds=rest, spare=rest / (2 * left - 1))
+        except NothingToTry as told:
+            if asked is not None or role.symmetry != "c1" or role.nearly:
+                raise
+            console.note(str(told))
 
     def show() -> None:
         for report in reports.values():

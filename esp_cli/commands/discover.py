@@ -10,7 +10,14 @@ from typer import Argument, Option
 
 from esp_cli import console
 from esp_cli.commands.check import print_elements
-from esp_cli.commands.options import JsonOption, SecondsOption, TaskSetOption, parse_task_settings, register_named
+from esp_cli.commands.options import (
+    JsonOption,
+    SecondsOption,
+    TaskSetOption,
+    note_idle_settings,
+    parse_task_settings,
+    register_named,
+)
 from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
@@ -71,7 +78,7 @@ def _discovery(
         data = read_transitions(path, spec)
         with console.watching("check", "elements") as watch:
             return check_recorded(what, spec, data, transforms, watch, seconds)
-    name = what
+    name, whole = what, settings
     if task is not None and not path.is_dir():
         raise UserError(f"--task is for a run, or a file of transitions, and there is no {what}; leave it out")
     if path.is_dir():
@@ -79,10 +86,12 @@ def _discovery(
         from esp_cli.training.settings import parse_config
 
         config = parse_config(RunFolder.open(path).config, path)
-        name, settings = config.task, config.task_settings | settings
+        name, whole = config.task, config.task_settings | settings
         if task not in (None, name):
             raise UserError(f"{what} is a run of {name}, and --task says {task}; leave --task out")
-    worlds = partial(make, name, settings=resolve_task_settings(name, settings))
+    whole = resolve_task_settings(name, whole)
+    note_idle_settings(name, settings, whole)
+    worlds = partial(make, name, settings=whole)
     with console.watching("check", "elements") as watch:
         return check_symmetry(worlds, transforms, logs, watch, seconds)
 

@@ -52,7 +52,9 @@ def evaluate(
     from esp_cli.policies.loading import open_policy
 
     options.register_named(task, [algo], network)
-    trained = open_policy(policy, algo, prior).transfer(options.parse_task_settings(settings or [], physics))
+    changed = options.parse_task_settings(settings or [], physics)
+    trained = open_policy(policy, algo, prior).transfer(changed)
+    options.note_idle_settings(trained.config.task, changed, trained.config.task_settings)
     for text in trained.notes:
         console.note(text)
     usual = max(1, min(EPISODES, _AGENT_STEPS // (trained.spec.horizon * trained.spec.num_agents)))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 import shlex
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -51,6 +51,14 @@ def note_without_effect(names: Iterable[str]) -> None:
     """Name the settings that were asked for and that change nothing beside the others."""
     if idle := ", ".join(sorted(names)):
         console.note(f"without effect beside the other settings: {idle}")
+
+
+def note_idle_settings(task: str, chosen: Iterable[str], settings: Mapping[str, object]) -> None:
+    """Name the chosen settings of a task that change nothing beside all that it is made with."""
+    from esp_envs.registry import task_class
+
+    idle = task_class(task).Settings(**settings).without_effect()
+    note_without_effect(f"task.{name}" for name in chosen if name in idle)
 
 
 def parse_task_settings(items: Iterable[str], physics: str | None = None) -> dict[str, object]:

@@ -88,6 +88,7 @@ def render(
     changed = options.parse_task_settings(settings or [], physics)
     named = [policy] if beside is None else [policy, beside]
     opened = [open_policy(where, algo, prior).transfer(changed) for where in named]
+    options.note_idle_settings(opened[0].config.task, changed, opened[0].config.task_settings)
     for text in dict.fromkeys(text for trained in opened for text in trained.notes):
         console.note(text)
     with console.watching("draw", "frames") as watch:

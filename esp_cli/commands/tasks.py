@@ -59,7 +59,7 @@ def describe(name: str) -> dict[str, Any]:
         "symmetries": list(dict.fromkeys(name for role, _ in spec.parts for name in carried_groups(role))),
         "heuristics": list(cls.heuristics),
         "settings": {
-            key: {"default": field.default, "description": field.description or ""}
+            key: {"default": field.get_default(call_default_factory=True), "description": field.description or ""}
             for key, field in cls.Settings.model_fields.items()
         },
         "card": inspect.cleandoc(cls.__doc__ or ""),

@@ -100,8 +100,9 @@ def compare(sample: Sample, runner: Runner) -> Agreement:
         differing = action != sample.action
         mask = None if sample.mask is None else torch.from_numpy(sample.mask)
         choosable = masked(torch.from_numpy(sample.outputs), mask).numpy()  # forbidden actions are out of reach
-        first, second = np.sort(choosable[differing], 1)[:, ::-1][:, :2].T
-        ties = bool((first - second <= 2 * TOLERANCE * largest).all())
+        if differing.any():
+            first, second = np.sort(choosable[differing], 1)[:, ::-1][:, :2].T
+            ties = bool((first - second <= 2 * TOLERANCE * largest).all())
     else:
         gap = max(gap, float(np.abs(action - sample.action).max()))
     if sample.after.size:  # after another choice the memory holds another previous action

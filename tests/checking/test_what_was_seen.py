@@ -1,5 +1,6 @@
 """What no single step from a state shows is found in later steps; what data could not have refused does not hold."""
 
+from dataclasses import replace
 from typing import ClassVar
 
 import pytest
@@ -224,6 +225,23 @@ def test_what_the_state_leaves_out_is_not_covered_where_no_later_step_tells():
 
 def test_a_task_that_raises_in_steps_that_follow_images_is_judged_by_the_others():
     assert verdict(Raising, "flip-y")[0] == "holds"
+
+
+class Calm(Point):  # where nothing but a height moves, and a wind would blow along x alone if there were one
+    size = 0.0
+
+    def _describe(self):
+        return replace(super()._describe(), action=Continuous(layout(Field("lift", Kind.SCALAR))))
+
+    def _advance(self, world, action):
+        world["position"] = world["position"] * torch.tensor([2.0, 0.0])
+        return -action[:, :, 0, 0].abs(), {}
+
+
+def test_an_element_that_moved_nothing_is_not_covered():
+    make = lambda count, seeds: Calm(Settings(), count, generators_for(seeds))  # noqa: E731
+    (found,) = check_symmetry(make, "rot90").elements
+    assert (found.outcome, found.reason) == ("not covered", "it moves nothing in the states that play visits")
 
 
 @pytest.mark.parametrize(("task", "field"), [(Cost, "reward"), (NoEnd, "end")])

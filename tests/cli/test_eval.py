@@ -131,6 +131,8 @@ def test_a_policy_is_judged_under_other_settings_of_its_task(finished: Path) -> 
     again = json.loads(
         esp("eval", finished, "--episodes", 2, "--set", "task.landmark_extent=1.0", "--json", "-").stdout
     )
+    idle = esp("eval", finished, "--episodes", 1, "--set", "task.local_ratio=0.9").stderr
+    assert "without effect beside the other settings: task.local_ratio" in idle
     assert trained["task_settings"]["landmark_extent"] is None
     assert again["task_settings"]["landmark_extent"] == 1.0
     assert again["greedy"]["mean"] != trained["greedy"]["mean"]

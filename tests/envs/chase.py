@@ -1,11 +1,13 @@
 """A task with two roles on a line, whose numbers are worked out by hand."""
 
 import torch
+from pydantic import Field as Setting
 
 from esp_envs import BatchedTask, Field, Items, Kind, layout
 from esp_envs.base import joined
 from esp_envs.roles import Role, spec_with_roles
-from esp_envs.spec import Discrete
+from esp_envs.settings import TaskSettings
+from esp_envs.spec import Continuous, Discrete
 
 STEPS = Discrete(Kind.PSEUDOSCALAR, ((-1.0,), (1.0,)), ("down", "up"))
 STEPS_OR_STAY = Discrete(Kind.PSEUDOSCALAR, ((-1.0,), (0.0,), (1.0,)), ("down", "stay", "up"))
@@ -48,3 +50,39 @@ class Chase(BatchedTask):
         hunters, prey = world["hunters"], world["prey"]
         others = torch.cat([hunters.flip(2), prey.expand(-1, -1, 2, -1)], -1)
         return joined([torch.cat([hunters, others], -1), torch.cat([prey, hunters], 2).flatten(2).unsqueeze(2)])
+
+
+class CrewSettings(TaskSettings):
+    speeds: tuple[float, float] = Setting(default_factory=lambda: (0.1, 0.1), description="of the two cars")
+
+
+class Crew(BatchedTask):
+    """Two cars on a line, and their boss, of whom nothing can be exchanged or turned."""
+
+    Settings = CrewSettings
+
+    def _describe(self):
+        force = Continuous(layout(Field("force", Kind.SCALAR)))
+        return spec_with_roles(
+            [
+                Role(name="car", num_agents=2, observation=layout(Field("place", Kind.SCALAR)), action=force),
+                Role(name="boss", num_agents=1, observation=layout(Field("mood", Kind.SCALAR)), action=force),
+            ],
+            name="crew",
+            version=1,
+            convention="distance",
+            horizon=5,
+            symmetry="agents",
+            state=layout(Field("places", Kind.SCALAR, 2, family="car"), Field("mood", Kind.SCALAR, family="boss")),
+        )
+
+    def _start(self, generator):
+        return {"places": self.draw(2, 1, generator=generator), "mood": self.draw(1, 1, generator=generator)}
+
+    def _advance(self, world, action):
+        world["places"] = world["places"] + torch.tensor(self.settings.speeds).view(2, 1) * action[:, :, :2]
+        world["mood"] = world["mood"] + 0.1 * action[:, :, 2:]
+        return -torch.cat([world["places"], world["mood"]], 2)[..., 0].abs(), {}
+
+    def _observe(self, world):
+        return joined([world["places"], world["mood"]])

@@ -26,6 +26,7 @@ from esp_envs import (
     make,
     register,
 )
+from esp_envs.adapters import foreign
 from esp_envs.adapters.gymnasium import SingleAgentSettings, SingleAgentTask
 from esp_envs.adapters.pettingzoo import ParallelSettings, ParallelTask
 from esp_envs.conformance import Subject, check
@@ -139,6 +140,7 @@ def give(value):
 
 PUSH = Continuous(layout(Field("push", Kind.VECTOR)))
 TURN = Continuous(layout(Field("turn", Kind.PSEUDOSCALAR)))
+WHEELS = Continuous(layout(Field("wheels", Kind.WHEELS)))
 
 
 def box(low, high, symmetry, action=PUSH):
@@ -222,6 +224,12 @@ MADE = {
     ),
     "off centre": (box([0, 0], [1, 1], "c2"), "by 'push', a vector, between .*, which 'c2' does not leave alone"),
     "boundless": (box([-3e38, -3e38], [3e38, 3e38], "c1"), "acts in Box.*, but the task says 2 bounded real numbers"),
+    "below a mirror": (box([-1, -1], [1, 3], "flip-x"), "which 'flip-x' does not leave alone"),
+    "beside a mirror": (box([-1, -1], [3, 1], "flip-y"), "which 'flip-y' does not leave alone"),
+    "a diagonal": (box([-1, -2], [1, 2], "flip-diagonal"), "which 'flip-diagonal' does not leave alone"),
+    "a quarter turn": (box([-1, -2], [1, 2], "rot90"), "which 'rot90' does not leave alone"),
+    "turns behind orders": (box([-1, -2], [1, 2], "agents*d4"), "which 'agents.d4' does not leave alone"),
+    "unlike wheels": (box([-1, -1], [1, 2], "flip-x", WHEELS), "by 'wheels', a wheels, between .*, which 'flip-x'"),
     "any turn": (box([-1, -2], [1, 2], "o2"), "'o2' does not leave alone; declare a smaller symmetry"),
     "fewer actions": (
         task(action=Discrete(Kind.SCALAR, ((0.0,), (1.0,)), ("a", "b"))),
@@ -244,6 +252,22 @@ MADE = {
     "wide mask": (task(masks=True, allowed=lambda *_: np.ones(4)), "a has a mask of 4 actions, but the task has 3"),
     "one-sided": (box([0], [1], "flip-x", TURN), "by 'turn', a pseudoscalar, between .*, which 'flip-x' does"),
 }
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "symmetry", "action"),
+    [
+        ([-1, -1], [3, 1], "flip-x", PUSH),
+        ([-1, -1], [1, 3], "front-back", PUSH),
+        ([-1, -2], [1, 2], "half-turn,flip-x", PUSH),
+        ([-1, -2], [1, 2], "c1", PUSH),
+        ([0, 0], [2, 2], "flip-x", WHEELS),
+        ([-1, -1], [1, 2], "c4", WHEELS),
+    ],
+)
+def test_bounds_that_a_symmetry_leaves_alone_are_taken(low, high, symmetry, action):
+    foreign.require_round(action, symmetry, "a", (np.float32(low), np.float32(high)))
+
 
 STEPPED = {
     "old step": (task(lambda self, out: tuple(out[:4])), "'step' returns 4 parts; return .observations, rewards, term"),

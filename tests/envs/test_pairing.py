@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from esp_cli import discrete_moves
 from esp_cli.checking import check_symmetry
 from esp_envs import Continuous, Environment, Field, Items, Kind, generators_for, layout
 from esp_envs.adapters.gymnasium import SingleAgentTask
@@ -190,6 +191,108 @@ def test_a_task_takes_and_puts_the_environment_that_it_made_where_agents_are_par
     state = env.reset().state + 0.5
     assert torch.allclose(env.set_state(state).state, state)
     assert torch.allclose(env.step(torch.zeros(1, 2, 2, 2)).next.obs.flatten(2), state)
+
+
+class Told(Both):
+    def _get_obs(self):
+        return [point._seen() for point in self.points]
+
+
+class Asked(Both):
+    def _get_obs(self, agent):
+        raise AssertionError("of whom is not known here")
+
+
+class Short(Both):
+    def _get_obs(self):
+        return np.zeros(7)
+
+
+@pytest.mark.parametrize(("env", "told"), [(Told, True), (Asked, False), (Short, False)])
+def test_what_agents_see_in_a_state_is_taken_where_it_is_all_that_they_see(env, told: bool) -> None:
+    cls = type("Placed", (BothPlaced,), {"make_one": lambda self: env()})
+    both = worlds(cls, 2)
+    state = both.reset().state + 0.5
+    seen = both.set_state(state)
+    assert bool(seen.obs.isnan().all()) is not told
+    assert not told or torch.allclose(seen.obs.flatten(2), state)
+
+
+class Board:
+    """A body on a board of 7 x 7 squares around the middle, which says in an info which ways lead off it."""
+
+    action_space, ways = gymnasium.spaces.Discrete(5), np.array([(0, 0), (1, 0), (0, 1), (-1, 0), (0, -1)])
+
+    def reset(self, seed=None, options=None):
+        self.place = np.random.default_rng(seed).integers(-3, 4, 2).astype(float)
+        return self._get_obs(), self._info()
+
+    def step(self, action):
+        self.place = self.place + self.ways[action] * self._info()["action_mask"][action]
+        return self._get_obs(), -float(np.abs(self.place).sum()), False, False, self._info()
+
+    def _get_obs(self):
+        return self.place.astype(np.float32)
+
+    def _info(self):
+        return {"action_mask": (np.abs(self.place + self.ways).max(1) <= 3).astype(np.int8)}
+
+
+class OnBoard(SingleAgentTask):
+    observation, masks = layout(Field("place", Kind.VECTOR)), True
+    simulated = layout(Field("place", Kind.VECTOR))
+    action, symmetry, convention = discrete_moves(["stay", "right", "up", "left", "down"]), "d4", "distance"
+
+    def make_single(self):
+        return Board()
+
+    def take(self, env):
+        return env.place
+
+    def put(self, env, state):
+        env.place = np.array(state, float).round()
+
+
+def test_a_mask_of_the_info_before_is_not_that_of_a_state() -> None:
+    env = worlds(OnBoard, 2)
+    env.reset()
+    seen = env.set_state(torch.full((1, 2, 2), 3.0))
+    assert seen.obs.isnan().all()
+    assert seen.action_mask.all(), "nobody knows it yet"
+    assert env.step(torch.zeros(1, 2, 1, dtype=torch.long)).next.action_mask[0, 0, 0].tolist() == [1, 0, 0, 1, 1]
+    assert {element.outcome for element in report(OnBoard, "d4").elements} == {"holds"}
+
+
+class Numbered:
+    """A body whose agent is called 0; an episode ends for good where it comes near the middle."""
+
+    possible_agents = (0,)
+
+    def action_space(self, agent):
+        return gymnasium.spaces.Box(-1.0, 1.0, (2,))
+
+    def reset(self, seed=None, options=None):
+        self.agents, self.place = [0], np.random.default_rng(seed).uniform(-1, 1, 2)
+        return {0: self.place.astype(np.float32)}, {0: {}}
+
+    def step(self, actions):
+        assert self.agents, "a step after the end"
+        self.place = self.place + 0.1 * actions[0]
+        near = bool(np.linalg.norm(self.place) < 0.3)
+        self.agents = [] if near else [0]
+        return {0: self.place.astype(np.float32)}, {0: -1.0}, {0: near}, {0: False}, {0: {}}
+
+
+class Counted(ParallelTask):
+    observation, action, symmetry, convention = layout(Field("place", Kind.VECTOR)), FORCE, "d4", "a step"
+    terminates = True
+
+    def make_one(self):
+        return Numbered()
+
+
+def test_an_agent_whose_name_is_0_ends_as_any() -> None:
+    assert worlds(Counted).settable()
 
 
 @pytest.mark.parametrize("workers", [0, 2])

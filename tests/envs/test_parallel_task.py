@@ -169,6 +169,42 @@ def test_what_an_opponent_draws_is_not_what_the_environment_draws() -> None:
     assert abs(start[0, 0, 0].item() - drawn[0][0]) > 1e-3
 
 
+class Unlike:
+    """An arm of three joints and a car that moves in the plane."""
+
+    possible_agents, joints = ("arm", "car"), {"arm": 3, "car": 2}
+
+    def action_space(self, agent):
+        return spaces.Box(-2.0, 2.0, (self.joints[agent],))
+
+    def reset(self, seed=None, options=None):
+        self.agents = list(self.possible_agents)
+        return dict.fromkeys(self.agents, np.zeros(2)), {}
+
+    def step(self, actions):
+        assert {name: action.shape for name, action in actions.items()} == {"arm": (3,), "car": (2,)}
+        paid = {name: float(action.sum()) for name, action in actions.items()}
+        return dict.fromkeys(self.agents, np.zeros(2)), paid, *[dict.fromkeys(self.agents, False)] * 2, {}
+
+
+class ArmAndCar(ParallelTask):
+    observation = {"arm": layout(Field("place", Kind.VECTOR)), "car": layout(Field("place", Kind.VECTOR))}  # noqa: RUF012
+    action = {  # noqa: RUF012
+        "arm": Continuous(layout(Field("joints", Kind.SCALAR, 3))),
+        "car": Continuous(layout(Field("velocity", Kind.VECTOR))),
+    }
+    symmetry, convention = "c1", "sum"
+
+    def make_one(self):
+        return Unlike()
+
+
+def test_each_role_is_given_as_many_numbers_as_it_acts_by() -> None:
+    env = ArmAndCar(ArmAndCar.Settings(), 1, generators_for([0]))
+    env.reset()
+    assert env.step(torch.full((1, 1, 2, 3), 0.5)).reward.tolist() == [[[3.0, 2.0]]]
+
+
 class Haunted(Walk):
     """The ghost leaves in its second step, in which it is still seen; then it may act no more."""
 

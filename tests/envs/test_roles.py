@@ -31,10 +31,11 @@ from esp_envs.adapters.pettingzoo import ParallelTask
 from esp_envs.conformance import QUICK, Subject, check
 from esp_envs.roles import Role, spec_with_roles
 from esp_envs.views import Lockstep, OthersAtRandom, RoleView, worlds_of_role
+from tests.cli.running import esp, refused
 from tests.envs.chase import STEPS, STEPS_OR_STAY, Chase
 from tests.envs.mpe_roles import MOVES, WORDS, SpeakerListener
 
-TASK = "tests.envs.chase:Chase"
+TASK, CREW = "tests.envs.chase:Chase", "tests.envs.chase:Crew"
 CALL = CliRunner()
 
 
@@ -391,3 +392,17 @@ def test_orders_of_agents_are_left_out_of_a_role_of_one_that_is_weighed(transfor
     names = {name: one.prior.transforms.names if one.prior.transforms else () for name, one in learner.each.items()}
     assert any("agents" in name for name in names["predators"])
     assert not any("agents" in name for name in names["prey"])
+
+
+def test_a_role_of_which_nothing_can_be_tried_hides_no_verdict_of_another() -> None:
+    held = esp("check", "symmetry", CREW)
+    assert "agents-1-0" in held.stdout
+    assert "no transform can be tried on boss" in held.stderr
+    lame = esp("check", "symmetry", CREW, "--set", "task.speeds=[0.1,0.5]", "--json", "-", code=1)
+    assert json.loads(lame.stdout)["car"]["report"]["elements"][0]["fields"][0]["outcome"] == "broken"
+    assert "no transform can be tried on car" in refused("check", "symmetry", CREW, "--transforms", "rot90")
+
+
+def test_a_default_that_is_made_is_on_the_card() -> None:
+    card = json.loads(esp("tasks", CREW, "--json", "-").stdout)
+    assert card["settings"]["speeds"] == {"default": [0.1, 0.1], "description": "of the two cars"}

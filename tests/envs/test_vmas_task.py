@@ -168,6 +168,13 @@ def test_a_layout_of_another_width_is_refused() -> None:
         Narrow(Narrow.Settings(), 2, generators_for([0]))
 
 
+@pytest.mark.parametrize("name", ["Passage", "Football", "WindFlocking"])
+def test_a_scenario_of_a_fixed_team_takes_no_other_number(name: str) -> None:
+    cls = getattr(vmas_scenarios, name)
+    with pytest.raises(ValueError, match="num_agents"):
+        cls.Settings(num_agents=cls.Settings().num_agents + 1)
+
+
 def test_arguments_that_a_scenario_does_not_take_are_refused() -> None:
     class Odd(vmas_scenarios.Balance):
         def arguments(self):

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -91,6 +92,13 @@ def test_another_memory_or_another_bounded_action_is_found(kind: str, spoilt: st
     assert compare(sample, runner(right)).max_difference == 0
     with pytest.raises(RuntimeError, match=r"differs from the policy by 0\.01"):
         compare(sample, runner(right | {spoilt: right[spoilt] + wrong}))
+
+
+def test_a_single_choice_agrees() -> None:
+    trained = drawn_policy("choice")
+    sample = take_sample(trained, program_of(trained.policy), 10)
+    one = replace(sample, outputs=sample.outputs[:, :1], action=np.zeros_like(sample.action))
+    assert compare(one, lambda sample: (sample.action, sample.outputs, sample.after)).other_actions == 0
 
 
 def test_layers_of_a_small_policy_by_hand() -> None:

@@ -127,7 +127,7 @@ def played(copy: Copy, space: Mapping[Any, Any], seed: int, steps: int) -> Mappi
     for _ in range(steps):
         action = {name: one.sample() for name, one in space.items()}
         following, _, *flags, _ = foreign.parts(copy.env.step(action), "step")
-        if any(map(any, foreign.ends(copy.env, copy.agents, *flags))):
+        if any(foreign.ends(copy.env, copy.agents, *flags)):
             return copy.start(seed)[0]
         seen = following
     return seen

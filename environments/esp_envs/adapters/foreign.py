@@ -24,8 +24,10 @@ _ADVICE = {
     _VECTOR: "return one environment; the copies are made here",
 }
 _PARTS = {"reset": ("observations", "infos"), "step": ("observations", "rewards", "terminated", "truncated", "infos")}
-_TURNS, _MIRRORS, _HALF = r"(o2|so2|[cd](?!1\b)\d+)", r"(o2|d\d|flip)", ("c2", "d2")
-"""Symmetries of the scene that turn a vector, that mirror it, and that turn it by a half at most."""
+_TURNS, _MIRRORS = r"o2|so2|[cd](?!1\b)\d|rot|quarter-turn|half-turn", r"o2|d\d|flip|left-right|front-back"
+_HALF = {"c2", "d2", "rot180", "half-turn"}
+"""Symmetries of the scene that turn a vector, that mirror it, and those that turn it by a half at most."""
+_NEGATED = {"flip-x": 1, "left-right": 1, "d1": 1, "flip-y": 0, "front-back": 0}  # part of a vector, by mirror
 EVERYONE = "__all__"  # the entry of a mapping of flags that speaks of all agents
 
 
@@ -187,14 +189,28 @@ def naming(place: str, what: str) -> Iterator[None]:
 
 
 def require_round(action: Continuous, symmetry: str, name: Any, box: tuple[NDArray[Any], NDArray[Any]]) -> None:
-    """Refuse bounds that break the declared symmetry: a turn needs equal ones around 0, a mirror some around 0."""
-    turns, mirrors = (re.match(pattern, symmetry) for pattern in (_TURNS, _MIRRORS))
+    """Refuse bounds that break the declared symmetry.
+
+    Of a vector a turn needs equal ones around 0, a half turn some around 0, and a mirror of an axis too for the part
+    that it negates. Under mirrors those of a pseudoscalar lie around 0, and both wheels have the same.
+    """
+    words = re.split(r"[*,]", symmetry)
+    turns, mirrors = ([word for word in words if re.match(pattern, word)] for pattern in (_TURNS, _MIRRORS))
     low, high = box
     for field, where in zip(action.layout.fields, action.layout.slices().values(), strict=True):
-        centred = np.allclose(low[where], -high[where])
-        equal = centred and (np.ptp(high[where]) == 0 or (turns is not None and turns[0] in _HALF))
-        bent = field.kind.is_vector and turns and not equal
-        if bent or (field.kind is Kind.PSEUDOSCALAR and mirrors and not centred):
+        lows, highs = low[where], high[where]
+        around = np.isclose(lows, -highs)
+        alike = around.all() and np.ptp(highs) == 0
+        if field.kind.is_vector:
+            negated = [_NEGATED.get(word) for word in mirrors if word not in turns]
+            bent = any(not alike if part is None else not around[part::2].all() for part in negated)
+            bent |= bool(turns) and not (around.all() if _HALF.issuperset(turns) else alike)
+        elif field.kind is Kind.PSEUDOSCALAR:
+            bent = bool(mirrors) and not around.all()
+        else:
+            unlike = any(not np.array_equal(end[0::2], end[1::2]) for end in (lows, highs))
+            bent = field.kind is Kind.WHEELS and bool(mirrors) and unlike
+        if bent:
             raise UserError(
                 f"{name} acts by '{field.name}', a {field.kind.name}, between {low[where].tolist()} and "
                 f"{high[where].tolist()}, which '{symmetry}' does not leave alone; declare a smaller symmetry, or "

@@ -232,6 +232,8 @@ class Copy:
 
     def native(self, i: int, action: Array) -> Any:
         """Return an action of learning agent i as the environment takes it."""
+        if not isinstance(kind := self.kinds[self.learners[i]].action, Discrete):
+            action = action[: kind.width]  # a row is as wide as the widest role's
         if (box := self._boxes[i]) is None:
             return self._starts[i] + int(action) if np.ndim(action) == 0 else np.nan_to_num(action).clip(-1, 1)
         low, high = box

@@ -7,6 +7,7 @@ what agents see. The rest says how by the hooks `simulated`, `take` and `put`.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -100,8 +101,15 @@ class Simulator:
         get = getattr(bare, "_get_obs", getattr(bare, "_get_ob", None))
         if not callable(get):
             return None
+        try:
+            inspect.signature(get).bind()
+        except (TypeError, ValueError):  # it has to be told of whom
+            return None
         seen = get()
-        return seen if isinstance(seen, Mapping) and set(agents) <= set(seen) else dict.fromkeys(agents, seen)
+        if isinstance(seen, Mapping) and set(agents) <= set(seen):
+            return seen
+        by_agent = isinstance(seen, tuple | list) and len(seen) == len(agents) > 1
+        return dict(zip(agents, seen, strict=True)) if by_agent else dict.fromkeys(agents, seen)
 
     def _columns(self) -> list[tuple[str, Sequence[Any], str, Items]]:
         """Return name, entities, attribute and items of each part of the state of particles; none of others."""

@@ -39,11 +39,12 @@ class VmasTask(Environment):
     come from torch; VMAS's own scenarios comply.
 
     Example:
-        class Passage(VmasTask):
-            scenario, symmetry, convention = "passage", "flip-y", "vmas passage"
+        class Flocking(VmasTask):
+            scenario, symmetry, convention = "flocking", "c1", "vmas flocking"
 
             def seen(self):
-                return layout(Field("position", Kind.VECTOR), Field("velocity", Kind.VECTOR), ...)
+                vectors = (Field(name, Kind.VECTOR) for name in ("position", "velocity", "from_target"))
+                return layout(*vectors, Field("lidar", Kind.RING, rays=12))
     """
 
     Settings: ClassVar[type[TaskSettings]] = VmasSettings

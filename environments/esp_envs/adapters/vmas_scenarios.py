@@ -177,7 +177,9 @@ def _scenario(name: str, *seen: str | Field, agents: int, fixed: bool = False, *
 
     An agent sees its position, its velocity and then what is `seen`; a name alone is that of a vector.
     """
-    settings = type("Settings", (VmasSettings,), {"__annotations__": {"num_agents": int}, "num_agents": agents})
+    least, most = (agents, agents) if fixed else (1, 64)
+    number = Setting(agents, ge=least, le=most, description="N, agents of the team")
+    settings = type("Settings", (VmasSettings,), {"__annotations__": {"num_agents": int}, "num_agents": number})
     whole = layout(*_OWN, *(_vector(one) if isinstance(one, str) else one for one in seen))
     members: dict[str, object] = {"Settings": settings, "scenario": name, "symmetry": "c1", "terminates": True}
     members |= {"convention": f"vmas {name}", "seen": lambda _: whole, "__module__": __name__}
@@ -214,6 +216,7 @@ Dropout = _scenario("dropout", "goal", Field("done", Kind.SCALAR), agents=4, fla
 Football = _scenario(
     "football",
     agents=6,
+    fixed=True,
     arguments=lambda _: {"ai_red_agents": False},
     seen=lambda _: {"agent_blue": _player("agent_red"), "agent_red": _player("agent_blue")},
 )
