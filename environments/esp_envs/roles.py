@@ -6,6 +6,7 @@ role's, zeros fill the others, and a discrete action counts as far as the larges
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
@@ -84,9 +85,10 @@ def spec_with_roles(roles: Sequence[Role], *, symmetry: str, state: Layout | Non
 
 
 def without_agents(transforms: str) -> str:
-    """Return transforms for a role of one agent, which changes places with nobody: "d4" for "d4*agents,agents"."""
+    """Return transforms for a role of one agent, which changes places with nobody: "d4" for "d4*agents,agents-1-0"."""
     products = (part.strip().split("*") for part in transforms.split(","))
-    return ",".join(filter(None, ("*".join(f for f in factors if f != "agents") for factors in products)))
+    rest = ("*".join(f for f in factors if not re.fullmatch(r"agents(-\d+)*", f)) for factors in products)
+    return ",".join(filter(None, rest))
 
 
 def _widest(actions: Sequence[ActionSpace]) -> ActionSpace:

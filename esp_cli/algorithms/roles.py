@@ -72,7 +72,7 @@ class RolesLearner(Learner):
             prior = prior.model_copy(update={"transforms": rest} if rest else {"kind": "none"})
         if prior.weights and prior.kind != "none":
             elements = admitted_elements(prior.transforms, unrestricted(role))
-            names = set() if isinstance(elements, Group) else {element.name for element in elements}
+            names = {elements.name} if isinstance(elements, Group) else {element.name for element in elements}
             prior = prior.model_copy(update={"weights": {n: w for n, w in prior.weights.items() if n in names}})
         reads_all = getattr(config, "critic_input", None) == "observations" and role.joint_fields is not None
         if reads_all and not network.free_of_counts:  # a network over sets takes rows of the role's own agents alone

@@ -160,7 +160,8 @@ class GaussianPolicies:
         self._deviation = WithVJP(log_std, lambda slope: [slope], [log_std])
         means, items = frame.pull_outputs(outputs.tensor), frame.pull_items(item, outputs.tensor)
         self._shape, self._means = means.shape, means.flatten(2, -2)
-        # [S, P, R, W], or [S, 1, 1, W] where all parts have their items in the same places
+        self._shares_items = items is None  # all parts have their items in the same places
+        # [S, P, R, W], or [S, 1, 1, W]
         self._item = item.expand(len(log_std), 1, 1, -1) if items is None else items.flatten(2, -2)
         self._log_std = log_std.detach().gather(1, self._item.flatten(1)).view(self._item.shape)
         self._precision, self.sizes = (-self._log_std).exp(), tuple(self._means.shape[:3])
@@ -223,7 +224,7 @@ class GaussianPolicies:
     def _add_by_items(self, total: Tensor, slopes: Tensor, parts: slice) -> None:
         """Add slopes by the deviations of some parts [S, P, R, W] to those by the items [S, items]."""
         item = self._of(self._item, parts)
-        slopes = slopes.sum((1, 2), keepdim=True) if item.shape[2] == 1 else slopes
+        slopes = slopes.sum((1, 2), keepdim=True) if self._shares_items else slopes
         total.scatter_add_(1, item.expand_as(slopes).flatten(1), slopes.flatten(1))
 
 

@@ -39,13 +39,22 @@ class SetEquivariantConfig(SetConfig):
         io = sets_or_refuse(self.name, self.io_or_refuse(io))
         if self.memory:
             raise UserError("set-equivariant remembers nothing; use set with network.memory")
-        if io.num_values is not None:
-            return SetNetwork(generators, io, outputs, self, output_gain)
         action = io.spaces.action
         kinds = {action.kind} if isinstance(action, Discrete) else {field.kind for field in action.layout.fields}
-        if kinds != {Kind.VECTOR}:
+        if io.num_values is None and kinds != {Kind.VECTOR}:
             raise UserError("set-equivariant acts along directions of the plane; use set for other actions")
+        ways = {point for point in action.points if any(point)} if isinstance(action, Discrete) else ()
+        io.group(f"d{len(ways)}" if ways and kinds == {Kind.VECTOR} else "d4")  # refused where the task has it not
+        if io.num_values is not None:
+            return SetNetwork(generators, io, outputs, self, output_gain)
         if isinstance(action, Discrete):
+            first = {point: name for name, point in reversed([*zip(action.names, action.points, strict=True)])}
+            for name, point in zip(action.names, action.points, strict=True):
+                if first[point] != name:
+                    raise UserError(
+                        f"set-equivariant tells actions apart by their directions, and '{first[point]}' and '{name}' "
+                        "have the same; use set"
+                    )
             return DirectionActor(generators, io, self, output_gain)
         return ForceActor(generators, io, self, action.layout.width // 2, output_gain)
 
@@ -159,6 +168,8 @@ class ForceActor(Memoryless):
             SeedLinear(generators, config.width, _SUMS * count, 1.0) for count in counts if count
         )
         num_vectors = _SUMS * sum(counts) + len(rows.own_columns[0])
+        if not num_vectors:
+            raise UserError("set-equivariant makes forces of vectors, and none is seen; use set")
         sizes = (self.features.width + num_vectors, *config.hidden, forces * num_vectors)
         self.head = SeedMLP(generators, sizes, config.activation, output_gain, compiled=config.compiled is True)
 

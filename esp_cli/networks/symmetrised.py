@@ -17,6 +17,7 @@ from esp_cli.symmetry.representation import layout_operator
 from esp_envs.errors import UserError
 from esp_envs.spec import ActionSpace, Discrete, Kind
 
+_LESS, _ROUNDING = 0.37, 1e-5  # how much less each further vector counts, and the share of its parts that makes a sum 0
 LOCAL = "local-"  # begins the name of a group whose elements are chosen by the input's frame, as "local-d4"
 
 
@@ -65,7 +66,8 @@ class LocalFrame(Memoryless, Symmetrised):
 
     g(x) is the element whose image of the sum of all vectors of x lies nearest to a direction within one sector of the
     group, so that g(h x) = g(x) h^-1. That is the idea of LEGO (Wang et al., 2025), whose frame is the agent's velocity
-    and the side of the centre of all. Where two images are as near, as for a sum of 0, the first is taken.
+    and the side of the centre of all. Where that sum is 0, as of the ways between agents in a row of all of them, the
+    vectors count less one after the other. Where two images are as near, the first is taken.
     """
 
     def __init__(self, network: Network, io: IoSpec, group: str) -> None:
@@ -74,20 +76,31 @@ class LocalFrame(Memoryless, Symmetrised):
             raise UserError(
                 f"network.symmetrise={LOCAL}{group} is for networks without memory and messages; use {group}"
             )
-        sector = Fraction(1, self.group.order)
-        on_axis = PlaneElement(sector, mirrored=True) in map(PlaneElement.of, self.group.elements)
+        sector, planar = Fraction(1, self.group.order), {PlaneElement.of(element) for element in self.group.elements}
+        if len(planar) < self.group.order:
+            raise UserError(f"network.symmetrise={LOCAL}{group} moves items, which no frame tells apart; use {group}")
+        on_axis = PlaneElement(sector, mirrored=True) in planar
         angle = math.pi * sector * (2 if on_axis else 1)  # a mirror leaves a direction on its axis alone
         vectors = [column for field, column in items_of(io.layout.fields) if field.kind == Kind.VECTOR]
         if not vectors:
             raise UserError(f"network.symmetrise={LOCAL}{group} needs vectors, and {io.spaces.label} shows none")
         along = torch.zeros(io.layout.width)
         along[vectors], along[[column + 1 for column in vectors]] = math.cos(angle), math.sin(angle)
+        weights = torch.zeros_like(along)
+        for k, column in enumerate(vectors):
+            weights[column : column + 2] = 1 / (1 + _LESS * k)
         self.along: Tensor
+        self.along_weighed: Tensor
         self.register_buffer("along", along, False)
+        self.register_buffer("along_weighed", along * weights, False)
 
     def forward(self, x: Tensor) -> Tensor:
         images = self._images(x).unflatten(1, (self.group.order, -1))  # [S, G, B, in]
-        chosen = (images @ self.along).argmax(1)  # [S, B]
+        sums = images @ self.along  # [S, G, B]
+        is_none = sums.amax(1) <= _ROUNDING * (images[:, 0].abs() @ self.along.abs())
+        if is_none.any():
+            sums = torch.where(is_none.unsqueeze(1), images @ self.along_weighed, sums)
+        chosen = sums.argmax(1)  # [S, B]
         own = images.gather(1, chosen[:, None, :, None].expand(-1, 1, -1, x.shape[-1]))
         y = self.network.unroll(own.transpose(1, 2))  # [S, B, 1, out]
         return (y @ self.back[chosen]).squeeze(-2)

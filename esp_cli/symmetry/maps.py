@@ -150,11 +150,15 @@ def regular(group: FiniteGroup, copies: int) -> Block:
 
 
 def layout_blocks(layout: Layout, group: FiniteGroup) -> list[Block]:
-    """Return one block per field of a layout: a copy is an item, or the whole field where its items change places."""
+    """Return one block per field of a layout: a copy is an item, or the whole field where its items change places.
+
+    A field without items has none.
+    """
     elements, moves = group.elements, [item_places(field, group.elements) is not None for field in layout.fields]
     return [
         Block(field_operator(f, elements).matrix, 1) if moved else Block(item_operator(f, elements).matrix, f.count)
         for f, moved in zip(layout.fields, moves, strict=True)
+        if f.width
     ]
 
 

@@ -132,6 +132,8 @@ class Transform:
             expected = by.width // num_agents if agent_axis == -2 else by.width
         if x.shape[-1] != expected:
             raise UserError(f"a transform of {expected} numbers was given rows of {x.shape[-1]}")
+        if not x.numel():
+            return x.clone()
         rows = x.reshape(self._seeds_of(x), -1, by.width)
         return (by.pull(rows) if back else by.push(rows)).reshape(x.shape)
 

@@ -27,7 +27,7 @@ from esp_cli.training.build import (
 )
 from esp_cli.training.checkpoint import describe_policy, read_initial
 from esp_cli.training.config import RunConfig
-from esp_cli.training.metrics import MetricsWriter, column, read_metrics, truncate_metrics
+from esp_cli.training.metrics import RETURN, MetricsWriter, column, read_metrics, truncate_metrics
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.trackers import TrackedRun, open_trackers, require
 from esp_envs.errors import UserError
@@ -133,6 +133,8 @@ class Trainer:
                 self._refuse_if_all_stopped()
                 if not going and not self.is_complete:
                     return False
+            if not any(RETURN in row for row in read_metrics(self.folder.metrics_path)):  # they are lost
+                self._record(writer, self._evaluate(), listener)
             # before the trackers are closed: what another program does there must not keep a run from its policy
             returns = self.final_returns()["greedy"].tolist()
             meta = describe_policy(self.config, self.learner.spec, self.step, returns)

@@ -29,7 +29,7 @@ from esp_cli.training.config import RunConfig, resolve_config
 from esp_envs import Discrete, Field, Items, Kind, UserError, generators_for, joint_layout, layout, make, register
 from esp_envs.adapters.pettingzoo import ParallelTask
 from esp_envs.conformance import QUICK, Subject, check
-from esp_envs.roles import Role, spec_with_roles
+from esp_envs.roles import Role, spec_with_roles, without_agents
 from esp_envs.views import Lockstep, OthersAtRandom, RoleView, worlds_of_role
 from tests.cli.running import esp, refused
 from tests.envs.chase import STEPS, STEPS_OR_STAY, Chase
@@ -406,3 +406,14 @@ def test_a_role_of_which_nothing_can_be_tried_hides_no_verdict_of_another() -> N
 def test_a_default_that_is_made_is_on_the_card() -> None:
     card = json.loads(esp("tasks", CREW, "--json", "-").stdout)
     assert card["settings"]["speeds"] == {"default": [0.1, 0.1], "description": "of the two cars"}
+
+
+def test_a_role_of_one_agent_has_no_orders_and_a_sampled_group_keeps_its_weight() -> None:
+    assert without_agents("rot90*agents-1-0-2, agents-1-0-2, d4*agents") == "rot90,d4"
+    settings = {"task.control": "both", "mappo.num_envs": 2}
+    build_learner(resolve_config("predator-prey", overrides=settings | {"prior.transforms": "rot90*agents-1-0-2"}))
+    weighed = {"prior.transforms": "o2", "prior.trust": "measured", "prior.weights": {"o2": 0.5}}
+    learner = build_learner(
+        resolve_config("predator-prey", overrides=settings | weighed | {"task.actions": "continuous"})
+    )
+    assert all(one.prior.config.weights == {"o2": 0.5} for one in learner.each.values())

@@ -16,7 +16,7 @@ from esp_cli.symmetry import PlaneElement, cyclic, dihedral, parse_group, transf
 from esp_cli.symmetry.maps import Block, layout_blocks, regular, trivial
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
-from esp_envs import make
+from esp_envs import UserError, make
 from esp_envs.spec import Field, Kind, Spaces, TaskSpec, discrete_moves, layout
 from tests.networks.gradients import assert_same_gradients
 from tests.symmetry.checks import policy_equivariance_error
@@ -173,6 +173,28 @@ def test_a_local_frame_by_hand() -> None:
     blind = replace(spaces, observation=layout(Field("age", Kind.SCALAR)))
     with pytest.raises(ValueError, match=r"network\.symmetrise=local-c4 needs vectors, and the task shows none"):
         LocalFrame(Echo(), IoSpec(blind, "own", num_values=1), "c4")
+
+
+def test_a_local_frame_is_one_where_the_vectors_cancel() -> None:
+    """(3, 1) - (3, 1) / 1.37 points as (3, 1) does, and its turns with it."""
+    seen = layout(Field("ways", Kind.VECTOR, 2))
+    spaces = Spaces(num_agents=1, observation=seen, state=seen, action=discrete_moves(4), symmetry="c4")
+    network = LocalFrame(Echo(), IoSpec(spaces, "own", num_values=4), "c4")
+    rows = torch.tensor([[[3.0, 1.0, -3.0, -1.0], [-1.0, 3.0, 1.0, -3.0], [-3.0, -1.0, 3.0, 1.0]]])
+    assert network(rows).tolist() == [[[3.0, 1.0, -3.0, -1.0]] * 3]
+    orders = replace(spaces, symmetry="c4*ways-2")
+    with pytest.raises(UserError, match="moves items, which no frame tells apart; use c4"):
+        LocalFrame(Echo(), IoSpec(orders, "own", num_values=4), "c4*ways-2")
+
+
+def test_a_field_without_items_is_no_block() -> None:
+    seen = layout(Field("others", Kind.VECTOR, 0), Field("goal", Kind.VECTOR))
+    spaces = Spaces(num_agents=1, observation=seen, state=seen, action=discrete_moves(4), symmetry="c4")
+    io = IoSpec(spaces, "own", num_values=1)
+    network = build_network(generators(0, 1), 2, 1, NETWORKS["equivariant"](hidden=(4,), group="c4"), 1.0, io)
+    rows = torch.tensor([[3.0, 1.0], [-1.0, 3.0]]).expand(2, -1, -1)
+    here, there = network(rows).unbind(1)
+    torch.testing.assert_close(here, there)
 
 
 def test_a_recurrent_ensemble_keeps_the_memories_of_its_images_apart() -> None:

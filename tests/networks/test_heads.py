@@ -1,11 +1,13 @@
 """Policy heads: probabilities by hand, sampling in proportion, bounds, and what a symmetry does to them."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from esp_cli.networks.heads import BoundedGaussian, Categorical
+from esp_cli.networks.policies import GaussianPolicies, WithVJP
 from esp_cli.symmetry import transform_set
 from esp_envs import Continuous, Field, Kind, TaskSpec, layout, make
 
@@ -71,3 +73,19 @@ def test_pulled_back_policy_gives_an_action_the_probability_of_its_image():
     mean, latent = torch.randn(1, 20, 3, 2), torch.randn(1, 20, 3, 2)
     ours = gaussian.log_prob(turn.pull_back(mean), latent)
     torch.testing.assert_close(ours, gaussian.log_prob(mean, turn.action(latent)), rtol=1e-4, atol=1e-5)
+
+
+def test_slopes_by_deviations_add_up_over_rows_where_copies_move_items():
+    """In the second part the items are exchanged, so its slopes are by the other's deviation; rows may come singly."""
+    means, log_std = torch.randn(2, 2, 3, 1, 2), torch.randn(2, 2)
+    places = torch.tensor([[0, 1], [1, 0]]).view(1, 2, 1, 1, 2).expand(2, 2, 3, 1, 2)
+
+    def slopes(rows):
+        frame = SimpleNamespace(
+            pull_outputs=lambda outputs: outputs, pull_items=lambda item, outputs: places[:, :, rows].contiguous()
+        )
+        outputs = WithVJP(means[:, :, rows], lambda slope: [slope], [means])
+        policies = GaussianPolicies(outputs, frame, log_std, torch.arange(2).view(1, 1, 1, 2))
+        return policies.add_divergence_slope(None, 1.0)[1]
+
+    torch.testing.assert_close(sum(slopes(slice(k, k + 1)) for k in range(3)), slopes(slice(3)))

@@ -18,6 +18,7 @@ from esp_cli.networks.sets import SetConfig
 from esp_cli.training.build import build_learner, generators
 from esp_cli.training.config import resolve_config
 from esp_envs import Discrete, Field, Items, Kind, Spaces, UserError, layout, make
+from esp_envs.mpe.task import FORCE
 from tests.networks.kernels.compiler import assert_same_bits_alone_and_for_any_threads, needs_compiler
 
 CLOSE = {"atol": 1e-5, "rtol": 1e-5}
@@ -432,6 +433,27 @@ def test_memory_behind_sets_unrolls_as_it_steps_and_knows_no_order():
         other = x.clone()
         other[:, :, 0, column] += 1
         assert not torch.allclose(built.unroll(other)[:, :, -1], whole[:, :, -1], **CLOSE)
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        (
+            {"action": Discrete(Kind.VECTOR, ((0.0, 0.0), (1.0, 0.0), (0.0, 0.0)), ("stay", "go", "load"))},
+            "tells actions apart by their directions, and 'stay' and 'load' have the same",
+        ),
+        ({"symmetry": "c1", "nearly": ""}, "is no symmetry of its dynamics and reward"),
+        (
+            {"action": FORCE, "observation": layout(Field("heights", Kind.SCALAR, 3, family="hill"))},
+            "makes forces of vectors, and none is seen",
+        ),
+    ],
+)
+def test_what_the_equivariant_network_over_sets_cannot_tell_or_make_is_refused(changes, sentence):
+    spec = replace(scene()[0], **changes)
+    io = IoSpec(spec, "own")
+    with pytest.raises(UserError, match=sentence):
+        build_network(generators((0,), "x"), io.layout.width, 5, SetEquivariantConfig(), 1.0, io)
 
 
 def test_the_equivariant_network_over_sets_remembers_nothing():

@@ -281,3 +281,11 @@ def test_a_gpu_draws_and_computes_the_same(make_spec, text) -> None:
     assert torch.equal(here.state(state), there.state(state.cuda()).cpu())
     assert torch.equal(here.action(action), there.action(action.cuda()).cpu())
     assert torch.equal(here.pull_back(logits), there.pull_back(logits.cuda()).cpu())
+
+
+def test_rows_of_no_numbers_stay():
+    seen = layout(Field("others", Kind.VECTOR, 0))
+    spaces = Spaces(num_agents=1, observation=seen, state=seen, action=FOUR_DIRECTIONS, symmetry="d4")
+    transform = build_transform([rotation(90)], spaces)
+    assert transform.obs(torch.zeros(1, 3, 1, 0)).shape == (1, 3, 1, 0)
+    assert transform.state(torch.zeros(1, 3, 0)).shape == (1, 3, 0)

@@ -93,6 +93,17 @@ def test_a_run_whose_metrics_are_gone_says_so(tmp_path):
     assert resumed.notes == [f"{halted.metrics_path} is gone; curves of this run begin at step {resumed.step}"]
 
 
+def test_a_run_that_is_through_is_ended_though_its_metrics_and_its_policy_are_lost(tmp_path):
+    folder = tiny_folder(tmp_path / "run")
+    assert trainer(folder).run(lambda news: True)
+    written = folder.policy_path.read_bytes()
+    folder.metrics_path.unlink()
+    folder.policy_path.unlink()
+    assert trainer(folder).run(lambda news: True)
+    assert folder.policy_path.read_bytes() == written
+    assert [row["step"] for row in read_metrics(folder.metrics_path)] == [300]
+
+
 def test_every_step_is_evaluated_in_worlds_of_its_own(tmp_path):
     """The policy stays as it began, so that the worlds alone make the returns differ."""
     folder = tiny_folder(tmp_path / "run", mappo__learning_rate=1e-30)
