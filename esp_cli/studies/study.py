@@ -243,8 +243,8 @@ class StudyFolder:
             if theirs.config == cell.config and other.is_finished(theirs)
         )
         finals = ((path, read_evaluation(path)) for path in alike)
-        version = _task_version(cell.config)
-        return next((path for path, one in finals if one is None or one.task_version == version), None)
+        of_rules = (path for path, one in finals if one is None or one.task_version == _task_version(cell.config))
+        return next(of_rules, None)
 
     def adopt(self, cell: Cell, twin: Path) -> None:
         """Take a finished run over as this cell's, without links, which bring in files from anywhere; its log tells."""
