@@ -196,12 +196,16 @@ class _Pairs:
             reason = f"the task raises in the transformed states: {type(error).__name__}: {error}"
             return ElementVerdict(element.name, declared, (), reason)
         found = ElementVerdict(element.name, declared, tuple(merged(verdicts)))
-        moves = any(
-            not torch.equal(moved, own)
+        if found.outcome == "holds" and not self._moves(transform):
+            return replace(found, fields=(), reason=_UNMOVED)
+        return found
+
+    def _moves(self, transform: Transform | Unmoved) -> bool:
+        """Return whether any visited state or action has another image than itself."""
+        return any(
+            not (torch.equal(transform.state(state), state) and torch.equal(transform.action(action), action))
             for state, action in self._visited
-            for moved, own in ((transform.state(state), state), (transform.action(action), action))
         )
-        return found if moves or found.outcome != "holds" else replace(found, fields=(), reason=_UNMOVED)
 
     def broken_later(self, element: Element | Shift) -> tuple[FieldVerdict, ...] | None:
         """Return fields that are broken in so many states that rounding, which grows, is no reason.

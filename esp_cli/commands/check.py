@@ -136,7 +136,11 @@ def _of_the_symmetry(spec: TaskSpec, of_role: bool = False) -> Finding:
         admit_declared(spec)
     except ValueError as error:
         return Finding(said, broken=str(error))
-    return Finding(said, not_asked="none is declared" if spec.symmetry == "c1" and not spec.nearly else None)
+    return Finding(said, not_asked=None if _declares(spec) else "none is declared")
+
+
+def _declares(spec: TaskSpec) -> bool:
+    return spec.symmetry != "c1" or bool(spec.nearly)
 
 
 def _check_roles(
@@ -159,7 +163,7 @@ def _check_roles(
                 rest = until - time.monotonic()
                 reports[role.name] = check_symmetry(make, asked, watch=watch, seconds=rest, spare=rest / (2 * left - 1))
         except NothingToTry as told:
-            if asked is not None or role.symmetry != "c1" or role.nearly:
+            if asked is not None or _declares(role):
                 raise
             console.note(str(told))
 
@@ -187,7 +191,7 @@ def _check_symmetry(
             report = check_symmetry(make_worlds, transforms, watch=watch, seconds=seconds)
     except NothingToTry as told:
         spec, why = make_worlds(1, [0]).spec, str(told)
-        if policy is not None or transforms is not None or spec.symmetry != "c1" or spec.nearly:
+        if policy is not None or transforms is not None or _declares(spec):
             raise
         said = f"{why}; the task declares no symmetry either, so all that is declared holds"
         console.result(json, {"report": None, "holds": True, "policy": []}, lambda: console.say(said))

@@ -108,22 +108,15 @@ def search_or_forecast(search: Search, kind: str, choices: StudyChoices) -> None
     from esp_cli.studies.study import StudyFolder
 
     out, planned, fresh = choices.folder(kind), search.trials, None
-
-    def plan() -> tuple[Trials, Study]:
-        """Plan trials and what judges them; this refuses folders that cannot take them, before anything is trained."""
-        trials, _ = Trials.planned(out, planned)
-        study = search.forecast(trials)
-        StudyFolder.planned(out / FRESH, study, search.keeps)
-        return trials, study
-
+    trials, _ = Trials.planned(out, planned)
+    study = search.forecast(trials)
+    StudyFolder.planned(out / FRESH, study, search.keeps)  # refuses folders before anything is trained
     if choices.dry_run:
-        trials, study = plan()
         groups = {": ".join(one): own for one, own in search.trials_of.items()}
         what = f"{len(search.draws)} trials of each, and the runs that judge"
         forecast(StudyFolder(out / FRESH, study), choices, trials, groups, what)
         return
     with working(choices, out, search.request.device) as resources:
-        plan()
         trials = Trials.create(out, planned)
         failed = follow(trials, trials.cells_of(planned), resources)
         if not (resources.requests or failed):

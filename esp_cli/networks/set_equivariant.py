@@ -48,12 +48,11 @@ class SetEquivariantConfig(SetConfig):
         if io.num_values is not None:
             return SetNetwork(generators, io, outputs, self, output_gain)
         if isinstance(action, Discrete):
-            first = {point: name for name, point in reversed([*zip(action.names, action.points, strict=True)])}
-            for name, point in zip(action.names, action.points, strict=True):
-                if first[point] != name:
+            for k, point in enumerate(action.points):
+                if (first := action.points.index(point)) < k:
                     raise UserError(
-                        f"set-equivariant tells actions apart by their directions, and '{first[point]}' and '{name}' "
-                        "have the same; use set"
+                        f"set-equivariant tells actions apart by their directions, and '{action.names[first]}' and "
+                        f"'{action.names[k]}' have the same; use set"
                     )
             return DirectionActor(generators, io, self, output_gain)
         return ForceActor(generators, io, self, action.layout.width // 2, output_gain)

@@ -52,7 +52,7 @@ def plan(name: str, request: Request) -> Study:
 def refuse_untrainable(study: Study) -> None:
     """Refuse a study of which a run cannot be built, before there is a folder; a GPU need not be here."""
     for cell in study.cells:
-        build_learner(cell.config.of_one_seed().model_copy(update={"device": "cpu"}))
+        build_learner(cell.config.of_one_seed())
 
 
 def without_effect(name: str, request: Request) -> list[str]:

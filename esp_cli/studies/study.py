@@ -109,8 +109,6 @@ class StudyFolder:
     @classmethod
     def planned(cls, path: Path, study: Study, keep: bool = True) -> tuple[Self, bool]:
         """Return what `create` makes of a study, and whether that differs from what is there; writes nothing."""
-        # As JSON shows it, so that it equals what is read again: a tuple in a task's settings becomes a list.
-        study = Study.model_validate_json(study.model_dump_json())
         cls.refuse_foreign(path)
         if not cls.is_one(path):
             return cls(path, study), True
@@ -199,7 +197,9 @@ class StudyFolder:
 
     def is_finished(self, cell: Cell) -> bool:
         """Return whether a cell has ended: its policy is evaluated, or every seed stopped."""
-        return self.has_stopped(cell) or (self.is_trained(cell) and read_evaluation(self.run_path(cell)) is not None)
+        if self.is_trained(cell):
+            return read_evaluation(self.run_path(cell)) is not None
+        return self.has_stopped(cell)
 
     def next_command(self, cell: Cell) -> list[str]:
         """Return the arguments that train a cell, or that evaluate it once it is trained."""

@@ -60,8 +60,7 @@ class Tuning(Search):
 
     def config(self, prior: str, settings: Mapping[str, object], seeds: Sequence[int]) -> RunConfig:
         """Resolve the run of a kind of prior with these settings over those of all runs."""
-        config = planned(self._asked(prior, settings, seeds))
-        return RunConfig.model_validate_json(config.model_dump_json())  # a tuple becomes a list, as when read again
+        return planned(self._asked(prior, settings, seeds))
 
     def _asked(self, prior: str, settings: Mapping[str, object], seeds: Sequence[int]) -> RunConfig:
         """Return a run before anything is measured for it; without a prior, none of its settings counts."""
@@ -120,17 +119,22 @@ class Tuning(Search):
     def _draws(self, budget: int) -> list[dict[str, object]]:
         """Return the default settings, and then those drawn that go together and are new."""
         generator, found, tried = random.Random(0), list[dict[str, object]]([{}]), count(1)
-        for prior in self.priors:
-            build_learner(self.config(prior, {}, self.trial_seeds).of_one_seed())
+
+        def build(settings: Mapping[str, object]) -> None:
+            for prior in self.priors:
+                build_learner(self.config(prior, settings, self.trial_seeds).of_one_seed())
+
+        build({})
         while len(found) < budget and next(tried) <= _TRIES * budget:
             settings = dict[str, object](drawn(self.space, generator))
+            if settings in found:
+                continue
             try:
-                for prior in self.priors if settings not in found else ():
-                    build_learner(self.config(prior, settings, self.trial_seeds).of_one_seed())
+                build(settings)
             except UserError as error:
                 self.refused.append(str(error))
             else:
-                found += [settings] if settings not in found else []
+                found.append(settings)
         return found
 
     def trial(self, candidate: Candidate, draw: int) -> Cell:

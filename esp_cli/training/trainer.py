@@ -122,6 +122,8 @@ class Trainer:
         with MetricsWriter(self.folder.metrics_path, sinks) as writer:
             if self.iteration == 0 and not self._record(writer, self._evaluate(), listener):
                 return False
+            if self.is_complete and not any(RETURN in row for row in read_metrics(self.folder.metrics_path)):
+                self._record(writer, self._evaluate(), listener)  # they are lost
             while not self.is_complete:
                 tick = time.monotonic()
                 row = self._iterate()
@@ -133,8 +135,6 @@ class Trainer:
                 self._refuse_if_all_stopped()
                 if not going and not self.is_complete:
                     return False
-            if not any(RETURN in row for row in read_metrics(self.folder.metrics_path)):  # they are lost
-                self._record(writer, self._evaluate(), listener)
             # before the trackers are closed: what another program does there must not keep a run from its policy
             returns = self.final_returns()["greedy"].tolist()
             meta = describe_policy(self.config, self.learner.spec, self.step, returns)

@@ -57,7 +57,7 @@ class CrewSettings(TaskSettings):
 
 
 class Crew(BatchedTask):
-    """Two cars on a line, and their boss, of whom nothing can be exchanged or turned."""
+    """Two cars on a line and their boss, whose mood no transform moves."""
 
     Settings = CrewSettings
 

@@ -255,18 +255,24 @@ MADE = {
 
 
 @pytest.mark.parametrize(
-    ("low", "high", "symmetry", "action"),
+    ("low", "high", "taken", "refused", "action"),
     [
-        ([-1, -1], [3, 1], "flip-x", PUSH),
-        ([-1, -1], [1, 3], "front-back", PUSH),
-        ([-1, -2], [1, 2], "half-turn,flip-x", PUSH),
-        ([-1, -2], [1, 2], "c1", PUSH),
-        ([0, 0], [2, 2], "flip-x", WHEELS),
-        ([-1, -1], [1, 2], "c4", WHEELS),
+        ([-1, -1], [3, 1], {"flip-x", "c1"}, {"flip-y", "c2"}, PUSH),
+        ([-1, -1], [1, 3], {"front-back"}, {"left-right", "half-turn"}, PUSH),
+        ([-1, -2], [1, 2], {"half-turn,flip-x", "c1"}, {"flip-diagonal", "o2"}, PUSH),
+        ([0, 0], [2, 2], {"flip-x", "d4"}, set(), WHEELS),
+        ([-1, -1], [1, 2], {"c4"}, {"d4"}, WHEELS),
     ],
 )
-def test_bounds_that_a_symmetry_leaves_alone_are_taken(low, high, symmetry, action):
-    foreign.require_round(action, symmetry, "a", (np.float32(low), np.float32(high)))
+def test_bounds_are_taken_where_a_symmetry_leaves_them_alone(low, high, taken, refused, action):
+    def is_taken(symmetry):
+        try:
+            foreign.require_round(action, symmetry, "a", (np.float32(low), np.float32(high)))
+        except UserError as error:
+            return "does not leave alone" not in str(error)
+        return True
+
+    assert {symmetry for symmetry in taken | refused if is_taken(symmetry)} == taken
 
 
 STEPPED = {

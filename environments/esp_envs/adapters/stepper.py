@@ -51,10 +51,10 @@ class CopyStepper:
             state = self.board.state[NOW, k].copy()
             with copy.naming("put", k):
                 seen = copy.put(state)
-            if seen is None or not self._is_all(k, seen):  # nobody knows what agents see before the first step
+            if seen is None or not self._write_told(k, seen):  # nobody knows what agents see before the first step
                 self.board.obs[NOW, k], self.board.mask[NOW, k] = np.nan, True
 
-    def _is_all(self, k: int, seen: Mapping[str, Any]) -> bool:
+    def _write_told(self, k: int, seen: Mapping[str, Any]) -> bool:
         """Write what agents see in a state; False where they are given more, such as a mask in an info."""
         before = self._seen[k], self._infos[k]
         self._seen[k], self._infos[k] = seen, {}
