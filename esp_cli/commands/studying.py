@@ -108,6 +108,7 @@ def search_or_forecast(search: Search, kind: str, choices: StudyChoices) -> None
     from esp_cli.studies.study import StudyFolder
 
     out, planned, fresh = choices.folder(kind), search.trials, None
+    note_without_effect(search.without_effect())
     trials, _ = Trials.planned(out, planned)
     study = search.forecast(trials)
     StudyFolder.planned(out / FRESH, study, search.keeps)  # refuses folders before anything is trained

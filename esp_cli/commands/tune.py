@@ -10,7 +10,6 @@ from typer import Option
 
 from esp_cli import console
 from esp_cli.commands import studying
-from esp_cli.commands.options import note_without_effect
 from esp_cli.commands.study_options import StudyChoices, parse_names, study_command
 
 EPILOG = """Examples:\n
@@ -44,7 +43,6 @@ def tune(
     from esp_cli.studies.tuning import Tuning
 
     tuning = Tuning(choices.request(), parse_names(prior) or ("esp",), budget, trial_seeds, space)
-    note_without_effect([name for name in tuning.overrides if name in tuning.idle])
     if tuning.refused:
         console.note(f"{len(tuning.refused)} draws do not go together and are left out, the first: {tuning.refused[0]}")
     if len(tuning.draws) < budget:

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
-from esp_cli.defaults import __version__
+from esp_cli.defaults import EPISODES, __version__
 from esp_cli.networks.policy import Policy
 from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.policies.statistics import EpisodeSpread, SeedSummary, spread_over_episodes, summarise
@@ -166,9 +166,12 @@ def _means(episodes: Episodes) -> Metrics:
 
 
 def play_batches(config: RunConfig, controller: Controller, stream: str, episodes: int) -> Episodes:
-    """Play episodes (so many per seed) in batches whose worlds depend on the seeds, the stream and the batch alone."""
+    """Play episodes (so many per seed) in batches whose worlds depend on the seeds, the stream and the batch alone.
+
+    Up to `EPISODES` are one batch, so that a seed has the same worlds beside any number of other seeds.
+    """
     parts = []
-    batch = max(1, min(episodes, MAX_WORLDS // len(config.seeds)))
+    batch = min(episodes, max(EPISODES, MAX_WORLDS // len(config.seeds)))
     for begin in range(0, episodes, batch):
         env = build_environment(config, min(batch, episodes - begin), _STREAM, stream, begin)
         parts.append(play(env, controller))

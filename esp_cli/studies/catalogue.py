@@ -43,10 +43,15 @@ class Request:
 def plan(name: str, request: Request) -> Study:
     """Plan a study of a kind, by its name in `KINDS`."""
     kind = KINDS[name]
-    cells = tuple(cell.model_copy(update={"config": planned(cell.config)}) for cell in _cells(kind, request))
+    cells = planned_cells(_cells(kind, request))
     return Study(
         kind=name, title=kind.title, command=request.command, episodes=request.episodes, rows=kind.rows, cells=cells
     )
+
+
+def planned_cells(cells: Iterable[Cell]) -> tuple[Cell, ...]:
+    """Return what is run where these cells are asked for."""
+    return tuple(cell.model_copy(update={"config": planned(cell.config)}) for cell in cells)
 
 
 def refuse_untrainable(study: Study) -> None:
@@ -57,11 +62,15 @@ def refuse_untrainable(study: Study) -> None:
 
 def without_effect(name: str, request: Request) -> list[str]:
     """Return the settings that a user asked for and that change nothing in any run of a study of this kind."""
-    configs = [cell.config for cell in _cells(KINDS[name], request)]
-    idle = [(config, config.without_effect()) for config in configs]
+    return idle_settings(request.overrides, _cells(KINDS[name], request))
+
+
+def idle_settings(settings: Iterable[str], cells: Iterable[Cell]) -> list[str]:
+    """Return those of a user's settings that change nothing in any cell that is asked for, before it is planned."""
+    idle = [(cell.config, cell.config.without_effect()) for cell in cells]
     return [
         setting
-        for setting in request.overrides
+        for setting in settings
         if all(task_setting(setting, c.task) in names for c, names in idle if concerns(setting, c.task, c.algorithm))
     ]
 

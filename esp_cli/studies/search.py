@@ -23,7 +23,7 @@ from pydantic import BaseModel, JsonValue
 from esp_cli.files.documents import MAX_DOCUMENT_BYTES, parse_object, validate
 from esp_cli.files.opening import read_regular
 from esp_cli.files.writing import replace_file
-from esp_cli.studies.catalogue import Request
+from esp_cli.studies.catalogue import Request, idle_settings, planned_cells
 from esp_cli.studies.kinds import TRIALS
 from esp_cli.studies.plan import Cell, Study
 from esp_cli.studies.study import StudyFolder
@@ -95,11 +95,14 @@ class Search(ABC):
 
     @abstractmethod
     def trial(self, candidate: Candidate, draw: int) -> Cell:
-        """Return a candidate's run with the settings of a draw, by its number."""
+        """Return a candidate's run with the settings of a draw, by its number, before it is planned."""
 
     @abstractmethod
     def fresh(self, best: Mapping[Candidate, int]) -> list[Cell]:
-        """Return the runs that judge, by the number of each candidate's best draw; a candidate without one is out."""
+        """Return the runs that judge, before they are planned, by the number of each candidate's best draw.
+
+        A candidate without one is out.
+        """
 
     def refuse_trial_seeds(self) -> None:
         """Refuse a seed that judges and belongs to the trials."""
@@ -113,7 +116,13 @@ class Search(ABC):
     @cached_property
     def trials_of(self) -> dict[Candidate, list[Cell]]:
         """The trials of each candidate, one for each draw."""
-        return {one: [self.trial(one, draw) for draw in range(len(self.draws))] for one in self.candidates}
+        draws = range(len(self.draws))
+        return {one: list(planned_cells(self.trial(one, draw) for draw in draws)) for one in self.candidates}
+
+    def without_effect(self) -> list[str]:
+        """Return the settings that the user asked for and that change nothing in any trial."""
+        trials = (self.trial(one, draw) for one in self.candidates for draw in range(len(self.draws)))
+        return idle_settings(self.request.overrides, trials)
 
     @property
     def trials(self) -> Study:
@@ -150,7 +159,7 @@ class Search(ABC):
         if not best:
             raise UserError(f"a seed stopped in every trial in {trials.path}, so there is nothing to judge")
         failed = {": ".join(one): "a seed stopped in each of its trials" for one in self.candidates if one not in best}
-        return self._study(*self.judges, self.fresh(best), {**self.left_out, **failed})
+        return self._study(*self.judges, planned_cells(self.fresh(best)), {**self.left_out, **failed})
 
 
 def _scores(trials: Trials, cells: Mapping[Candidate, Sequence[Cell]]) -> dict[Candidate, list[float]]:

@@ -146,7 +146,7 @@ class Benchmark(Search):
         for name in self.boards:
             for method in self.methods:
                 try:
-                    build_learner(self.config(name, method, 0, trial=True).of_one_seed())
+                    build_learner(planned(self.config(name, method, 0, trial=True)).of_one_seed())
                 except UserError as error:
                     self.left_out[f"{name}: {method}"] = str(error)
                 else:
@@ -164,7 +164,7 @@ class Benchmark(Search):
         return max(1, steps * board.trial_steps // board.steps) if trial else steps
 
     def config(self, name: str, method: str, draw: int, trial: bool) -> RunConfig:
-        """Return the run of a method on a task with the settings of a draw."""
+        """Return the run of a method on a task with the settings of a draw, before it is planned."""
         board, request, algorithm = self.boards[name], self.request, self.algorithm
         preset = board.preset if (request.preset, algorithm) == ("default", "mappo") else request.preset
         networks = dict(zip((PERCEPTRON, HOMOMORPHIC), board.networks, strict=True))
@@ -175,7 +175,7 @@ class Benchmark(Search):
         tried = {key: value for key, value in self.draws[draw].items() if key not in idle}
         steps, seeds = self.steps(name, trial), self.trial_seeds if trial else request.seeds
         settings = {**board.settings, **own, **of_use(tried, str(own["prior.kind"])), **given}
-        return planned(resolve_config(board.task, algorithm, preset, steps, seeds, request.device, settings))
+        return resolve_config(board.task, algorithm, preset, steps, seeds, request.device, settings)
 
     def _cell(self, name: str, method: str, draw: int, trial: bool) -> Cell:
         learner = () if self.algorithm == "mappo" else (self.algorithm,)

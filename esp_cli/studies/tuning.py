@@ -30,7 +30,6 @@ class Tuning(Search):
 
     Attributes:
         refused: why draws were left out, one text each: their settings do not go together.
-        idle: settings that change nothing with any of the priors.
         hints: what the best trials tell of the space, one text each.
     """
 
@@ -59,11 +58,10 @@ class Tuning(Search):
         self.draws = self._draws(budget)
 
     def config(self, prior: str, settings: Mapping[str, object], seeds: Sequence[int]) -> RunConfig:
-        """Resolve the run of a kind of prior with these settings over those of all runs."""
-        return planned(self._asked(prior, settings, seeds))
+        """Resolve the run of a kind of prior with these settings over those of all runs, before it is planned.
 
-    def _asked(self, prior: str, settings: Mapping[str, object], seeds: Sequence[int]) -> RunConfig:
-        """Return a run before anything is measured for it; without a prior, none of its settings counts."""
+        Without a prior, none of its settings counts.
+        """
         chosen = {**self.overrides, "prior.kind": prior, **of_use(settings, prior)}
         request = self.request
         return resolve_config(self.task, self.algorithm, request.preset, self.steps, seeds, request.device, chosen)
@@ -73,7 +71,7 @@ class Tuning(Search):
         if file is not None:
             return {task_setting(name, self.task): tried for name, tried in read_space(file).items()}
         default = default_space(self.algorithm)
-        stored = self._asked(self.priors[0], {}, self.trial_seeds).model_dump(mode="json")
+        stored = self.config(self.priors[0], {}, self.trial_seeds).model_dump(mode="json")
         known = {**stored["algorithm_settings"], **stored["network"], **stored["prior"]}
         return {name: tried for name, tried in default.items() if known.get(name.rpartition(".")[2]) is not None}
 
@@ -81,7 +79,7 @@ class Tuning(Search):
         """Return the settings that change nothing with a prior, at the defaults and at each value that is checked."""
         space = of_use(self.space, prior)
         tried: list[dict[str, object]] = [{name: value} for name, d in space.items() for value in d.corners()]
-        configs = (self._asked(prior, settings, self.trial_seeds) for settings in ({}, *tried))
+        configs = (self.config(prior, settings, self.trial_seeds) for settings in ({}, *tried))
         return frozenset.intersection(*(config.without_effect() for config in configs))
 
     def _check(self) -> None:
@@ -89,7 +87,7 @@ class Tuning(Search):
         self.refuse_trial_seeds()
         if "prior.kind" in self.overrides or "prior.kind" in self.space:
             raise UserError("a tuning takes the kinds of prior by --prior, not by --set or --space")
-        effective, searched, idle = set[str](), set[str](), list[frozenset[str]]()
+        effective, searched = set[str](), set[str]()
         for prior in self.priors:
             space = of_use(self.space, prior)
             if not space:
@@ -106,11 +104,9 @@ class Tuning(Search):
                 if name in self.overrides:
                     raise UserError(f"--set {name} fixes what the space varies; leave it out, or use another --space")
                 for value in dimension.corners():
-                    self._asked(prior, {name: value}, self.trial_seeds)
-            idle.append(self._without_effect(prior))
+                    self.config(prior, {name: value}, self.trial_seeds)
             searched |= space.keys()
-            effective |= space.keys() - idle[-1]
-        self.idle = frozenset.intersection(*idle)
+            effective |= space.keys() - self._without_effect(prior)
         if lost := sorted(searched - effective):
             raise UserError(
                 f"the space varies '{lost[0]}', which is without effect beside the other settings; leave it out"
@@ -122,7 +118,7 @@ class Tuning(Search):
 
         def build(settings: Mapping[str, object]) -> None:
             for prior in self.priors:
-                build_learner(self.config(prior, settings, self.trial_seeds).of_one_seed())
+                build_learner(planned(self.config(prior, settings, self.trial_seeds)).of_one_seed())
 
         build({})
         while len(found) < budget and next(tried) <= _TRIES * budget:

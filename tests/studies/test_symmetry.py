@@ -66,6 +66,9 @@ def test_a_trial_has_its_own_seeds_and_fewer_steps_and_only_what_counts_is_drawn
     judged = asked.config("navigation", "ESP", 1, trial=False)
     assert (judged.seeds, judged.steps, judged.prior.consistency_coef) == ((0, 1, 2, 3), 200_000, 0.3)
     assert second.prior == first.prior, "nothing of a prior is drawn where there is none"
+    assert asked.without_effect() == []
+    idle = {"mappo.truncation": 5, "prior.old_log_prob": "recompute", "prior.replay": "stored"}
+    assert benchmark(overrides=idle).without_effect() == ["mappo.truncation", "prior.replay"]
     shorter = benchmark(steps=((None, 1000),))
     assert shorter.config("navigation", "plain", 0, trial=True).steps == 300
     pictures = benchmark(tasks=("wildlife",), variants=("plain", "homomorphic network"))
