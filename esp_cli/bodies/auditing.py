@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -95,23 +95,32 @@ def _words(row: Floats, labels: list[str]) -> str:
 def _called(function: Callable[..., Any], numbers: Numbers, rows: dict[str, Tensor]) -> dict[str, Tensor]:
     """Call a function as its parameters ask for, and return observations by group and actions."""
     groups = [name for name in numbers if name != ACTION]
-    takes = list(inspect.signature(function).parameters)
-    seen: Any = rows[groups[0]].clone() if groups else None
-    if len(groups) > 1:
-        try:
-            from tensordict import TensorDict  # noqa: PLC0415 - an extra
-        except ImportError:
-            raise UserError("groups of observations are handed over as a TensorDict; pip install tensordict") from None
-        seen = TensorDict({group: rows[group].clone() for group in groups}, batch_size=[len(rows[ACTION])])
+    try:
+        takes = inspect.signature(function).parameters
+    except (ValueError, TypeError) as error:
+        raise UserError(f"{last_line(error)}; give a function of Python that calls it") from None
     terms = {group: [field.name for field in numbers[group].fields] for group in groups}
     env = SimpleNamespace(observation_manager=SimpleNamespace(active_terms=terms))
     env.unwrapped = env
-    values = dict.fromkeys(_OBS, seen) | dict.fromkeys(_ACTIONS, rows[ACTION].clone()) | {"env": env}
-    known = {name: values[name] for name in takes if name in values}
-    try:
-        result = function(**known) if known else function(rows[ACTION].clone())
-    except (Exception, SystemExit) as error:
-        raise UserError(f"the function raises {last_line(error)}; it was given {', '.join(known) or ACTION}") from error
+    values = dict.fromkeys((*_OBS, *_ACTIONS, "env"))
+    known = {name: None for name in takes if name in values}
+    if any(one.kind is one.VAR_KEYWORD for one in takes.values()):
+        known |= dict.fromkeys(("env", "obs", "actions"))
+
+    def call(seen: Any) -> Any:
+        given = dict.fromkeys(_OBS, seen) | dict.fromkeys(_ACTIONS, rows[ACTION].clone()) | {"env": env}
+        return function(**{name: given[name] for name in known}) if known else function(rows[ACTION].clone())
+
+    errors = list[BaseException]()
+    for seen in _forms(rows, groups):
+        try:
+            result = call(seen)
+            break
+        except (Exception, SystemExit) as error:
+            errors.append(error)
+    else:
+        why = last_line(errors[0])  # of the tensor, which most functions take
+        raise UserError(f"the function raises {why}; it was given {', '.join(known) or ACTION}") from errors[0]
     results = tuple(result) if isinstance(result, tuple | list) else (result,)
     if not (seeing := set(known) & set(_OBS)):
         results = (None, results[-1])
@@ -129,3 +138,16 @@ def _called(function: Callable[..., Any], numbers: Numbers, rows: dict[str, Tens
     if not isinstance(acted, Tensor):
         raise UserError(f"the function returns {type(acted).__name__} as actions; return a tensor")
     return found | {ACTION: acted}
+
+
+def _forms(rows: dict[str, Tensor], groups: list[str]) -> Iterator[Any]:
+    """Yield observations as versions of rsl_rl hand them over: those of a single group as a tensor, all by group."""
+    if len(groups) < 2:
+        yield rows[groups[0]].clone() if groups else None
+    try:
+        from tensordict import TensorDict  # noqa: PLC0415 - an extra
+    except ImportError:
+        if len(groups) < 2:
+            return
+        raise UserError("groups of observations are handed over as a TensorDict; pip install tensordict") from None
+    yield TensorDict({group: rows[group].clone() for group in groups}, batch_size=[len(rows[ACTION])])

@@ -53,7 +53,8 @@ def mirror_of(body: Body, numbers: Numbers, group: str | None = None) -> ModuleT
 def _data(body: Body, numbers: Numbers, model: str, elements: Sequence[PlaneElement]) -> dict[str, object]:
     """Return the values of what `written` leaves open."""
     if not elements:
-        raise UserError(f"{model} has no symmetry, so there is no mirror to write")
+        late = next((f"; {reason}" for reason in body.refused.values() if reason.startswith("not covered")), "")
+        raise UserError(f"{model} has no symmetry that was found, so there is no mirror to write{late}")
     moves = {
         name: {element.name: _move(map_of(layout, element)) for element in elements} for name, layout in numbers.items()
     }

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from itertools import product
 
 import mujoco
 import numpy as np
@@ -27,7 +29,7 @@ TRIED = tuple(
         + [PlaneElement(turn, mirrored=True) for turn in _AXES]
     )
 )
-"""The elements that a model is searched for: turns by 1/2 to 1/8, and mirrors in lines between which such turns lie."""
+"""The elements that a model is searched for: turns by 1/2 to 1/6 and 1/8, and mirrors in lines between them."""
 
 LIMITS = (
     *("range", "stops", "torque range", "force range", "control range", "activation range", "early activation"),
@@ -98,16 +100,15 @@ def find(frame: Frame, tolerated: float) -> tuple[dict[PlaneElement, Found], dic
 
 
 def _outside(found: Mapping[PlaneElement, Found], idle: set[PlaneElement]) -> PlaneElement | None:
-    """Return the last of two elements whose product is not among them, or does something else."""
-    for g, first in found.items():
-        for h, second in found.items():
-            product = found.get(g @ h)
-            if (g @ h).is_identity or g @ h in idle:
-                continue
-            made = first.match.qvel @ second.match.qvel
-            if product is None or not np.allclose(product.match.qvel, made, atol=1e-6):
-                return max(g, h, key=TRIED.index)
-    return None
+    """Return the element most of whose products are not among them or do something else; of equal ones the last."""
+    wrong = Counter[PlaneElement]()
+    for (g, first), (h, second) in product(found.items(), repeat=2):
+        if (g @ h).is_identity or g @ h in idle:
+            continue
+        made, there = first.match.qvel @ second.match.qvel, found.get(g @ h)
+        if there is None or not np.allclose(there.match.qvel, made, atol=1e-6):
+            wrong.update({g, h})
+    return max(wrong, key=lambda g: (wrong[g], TRIED.index(g)), default=None)
 
 
 def differences(frame: Frame, match: Match) -> list[Difference]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
 from esp_cli.symmetry.elements import Floats
 from esp_envs.errors import UserError
@@ -18,9 +19,11 @@ QPOS_WIDTH, DOF_WIDTH = (7, 4, 1, 1), (6, 3, 1, 1)  # numbers of a joint's posit
 
 
 class Frame:
-    """A model at rest: where its joints and masses are, all seen from the middle of its base, its heaviest free body.
+    """A model at rest: where its joints and masses are, all seen from the middle of its base.
 
-    Other free bodies are put at the base, since where they begin is no property of theirs.
+    That is the free body on which most joints hang, of equal ones the heaviest. Other free bodies are put there, since
+    where they begin is no property of theirs. Without a free body, the base is what alone hangs on the world,
+    if it slides and turns there; else the world.
 
     Mirrors and turns leave `centre` [3] where it is; its z is 0. `axes` [3, 3] are the base's own, in columns: elements
     are told by them. `size` is the largest distance of a joint or mass from their middle, m. `places` [bodies, 2, 3]
@@ -34,7 +37,8 @@ class Frame:
         self.model, data = model, mujoco.MjData(model)
         self._seconds, self._until = seconds, time.thread_time() + seconds
         free = [j for j in range(model.njnt) if model.jnt_type[j] == FREE]
-        free.sort(key=lambda j: -model.body_subtreemass[model.jnt_bodyid[j]])
+        hanging = np.bincount(model.body_rootid[model.jnt_bodyid], minlength=model.nbody)
+        free.sort(key=lambda j: (-hanging[model.jnt_bodyid[j]], -model.body_subtreemass[model.jnt_bodyid[j]]))
         for j in free[1:]:
             data.qpos[self.qpos_of(j)][:3] = model.qpos0[self.qpos_of(free[0])][:3]
         mujoco.mj_kinematics(model, data)
@@ -42,9 +46,12 @@ class Frame:
         self.base = free[0] if free else None
         self.moving = [b for b in range(1, model.nbody) if model.body_jntnum[b]]
         self.children = {b: [c for c in self.moving if self.carrier(c) == b] for b in (0, *self.moving)}
-        self.centre = data.xpos[model.jnt_bodyid[free[0]] if free else self.children[0]].reshape(-1, 3).mean(0)
+        roots = [int(model.jnt_bodyid[free[0]])] if free else self.children[0]
+        self.centre = data.xpos[roots].mean(0)
         self.centre[2] = 0
-        self.axes = data.xmat[model.jnt_bodyid[free[0]]].reshape(3, 3).copy() if free else np.eye(3)
+        slides = SLIDE in model.jnt_type[self.joints(roots[0])] and model.body_dofnum[roots[0]] > 1
+        is_base = bool(free) or (len(roots) == 1 and slides)
+        self.axes = data.xmat[roots[0]].reshape(3, 3).copy() if is_base else np.eye(3)
         self.places = np.stack([data.xpos, data.xipos], 1) - self.centre
         self.anchor, self.axis = data.xanchor - self.centre, data.xaxis.copy()
         self.turned = data.xmat.reshape(-1, 3, 3).copy()
@@ -101,18 +108,35 @@ class Frame:
     def shapes(self) -> dict[int, list[tuple[int, int, Floats, Floats]]]:
         """By moving body, or the world (0), all that may touch: geom, type, middle [3], squared extent [3, 3].
 
-        A mesh has no extent; of a plane, the middle is a point over it, above or below `centre`.
+        Of a plane, the middle is a point over it, above or below `centre`.
         """
         model, found = self.model, dict[int, list[tuple[int, int, Floats, Floats]]]()
         for g in np.flatnonzero(self.touching.any(1)).tolist():
             kind, place, axes = int(model.geom_type[g]), self.geom_places[g], self._geom_axes[g]
-            half = model.geom_aabb[g, 3:] * (kind != mujoco.mjtGeom.mjGEOM_MESH)
+            extent = np.diag(model.geom_aabb[g, 3:] ** 2)
             if kind == mujoco.mjtGeom.mjGEOM_PLANE:
-                half, place = np.zeros(3), axes[:, 2] * (axes[:, 2] @ place + self.size)
+                extent, place = np.zeros((3, 3)), axes[:, 2] * (axes[:, 2] @ place + self.size)
+            elif kind == mujoco.mjtGeom.mjGEOM_MESH:
+                extent = self._extent(int(model.geom_dataid[g]))
             found.setdefault(int(model.body_weldid[model.geom_bodyid[g]]), []).append(
-                (g, kind, place, axes * half**2 @ axes.T)
+                (g, kind, place, axes @ extent @ axes.T)
             )
         return found
+
+    def _extent(self, mesh: int) -> Floats:
+        """Return the second moments [3, 3] of a mesh's convex hull, with which it touches, however it is meshed."""
+        start = int(self.model.mesh_vertadr[mesh])
+        points = self.model.mesh_vert[start : start + int(self.model.mesh_vertnum[mesh])].astype(np.float64)
+        middle = points.mean(0)
+        try:
+            corners = points[ConvexHull(points).simplices] - middle  # [faces, 3, 3]: with the middle, tetrahedra
+        except QhullError:  # it is flat
+            return np.cov(points.T, bias=True) + np.outer(middle, middle)
+        volume, total = np.abs(np.linalg.det(corners)), corners.sum(1)
+        volume /= volume.sum()
+        spread = np.einsum("f,fvi,fvj->ij", volume, corners, corners) + np.einsum("f,fi,fj->ij", volume, total, total)
+        centre = volume @ total / 4
+        return spread / 20 + np.outer(centre, middle) + np.outer(middle, centre) + np.outer(middle, middle)
 
     def qpos_of(self, joint: int) -> slice:
         """Return where the position of a joint is."""

@@ -41,9 +41,7 @@ class _OfModel(ParallelTask):
     arguments: ClassVar[Mapping[str, Any]] = {}
     """Further arguments of theirs."""
     keeps: ClassVar[tuple[str, ...]] = ("flip-x",)
-    """Elements that the reward leaves alone; those of them that the model has are the task's symmetry."""
-    exact: ClassVar[bool] = True
-    """Whether the model is its own mirror image to the last digit; else these hold only nearly."""
+    """Elements that the reward leaves alone; those of them that the model has exactly are the task's symmetry."""
     _known: ClassVar[dict[tuple[type, str], tuple[Layouts, float]]] = {}  # and the time of a step, s
 
     def __init__(self, settings: TaskSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
@@ -56,9 +54,9 @@ class _OfModel(ParallelTask):
             env.close()
         known, self.control_period_s = self._known[key]
         self.observation, self.action, self.simulated = known.observation, known.action, known.simulated
-        held = [Element((g,), order) for g, order in known.orders.items() if g.name in self.keeps]
-        found = ",".join(element.name for element in held) or "c1"
-        self.symmetry, self.nearly = (found, "") if self.exact else ("c1", found)
+        held = {g: Element((g,), order).name for g, order in known.orders.items() if g.name in self.keeps}
+        self.symmetry = ",".join(name for g, name in held.items() if g in known.exact) or "c1"
+        self.nearly = "" if held.keys() <= known.exact else ",".join(held.values())
         super().__init__(settings, num_envs, generators)
 
     def _layouts(self, env: Any) -> Layouts:
@@ -108,10 +106,11 @@ class MujocoTeam(_OfModel):
 
     def _layouts(self, env: Any) -> Layouts:
         agents = env.possible_agents
-        acts = np.arange(float(env.model.nu)).reshape(len(agents), -1)
+        ends = np.cumsum([env.action_spaces[agent].shape[0] for agent in agents])
+        acts = np.split(np.arange(float(env.model.nu)), ends[:-1])
         whole = env.map_local_actions_to_global_action(dict(zip(agents, acts, strict=True)))
-        acting = np.argsort(whole).reshape(acts.shape)
-        return layouts_of(Body.from_mjcf(env.model), env.data, lambda: list(env._get_obs().values()), acting.tolist())
+        acting = [own.tolist() for own in np.split(np.argsort(whole), ends[:-1])]
+        return layouts_of(Body.from_mjcf(env.model), env.data, lambda: list(env._get_obs().values()), acting)
 
 
 class Ant(MujocoTask):
@@ -136,7 +135,6 @@ class Humanoid(MujocoTask):
     """Gymnasium's Humanoid-v5; its model is its own mirror image but for a hip's armature and a knee's spring."""
 
     scenario, convention, terminates = "Humanoid-v5", "gymnasium Humanoid-v5", True
-    exact = False
 
 
 class Swimmer(MujocoTask):

@@ -20,7 +20,7 @@ from esp_cli.symmetry.elements import Element, Floats
 from esp_cli.symmetry.plane import PlaneElement
 from esp_cli.symmetry.representation import layout_operator
 from esp_envs.errors import UserError
-from esp_envs.installed import import_function
+from esp_envs.installed import import_function, last_line
 from esp_envs.spec import Layout, layout
 
 _MOST_BYTES = 1 << 20
@@ -39,7 +39,13 @@ def numbers_of(body: Body, order: str | None) -> Numbers:
         joints = [body.positions(names), body.velocities(names), actions]
         seen = layout(body.velocity(), body.spin(), body.gravity(), body.command(), *joints)
         return {"policy": seen, ACTION: layout(actions)}
-    told = import_function(order)(body)
+    function = import_function(order)
+    try:
+        told = function(body)
+    except UserError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise UserError(f"{order} raises {last_line(error)}; it was given the body") from error
     if not isinstance(told, dict) or not all(isinstance(part, Layout) for part in told.values()) or ACTION not in told:
         raise UserError(
             f"{order} returns {type(told).__name__}; return layouts of observations by name, and of 'action'"
@@ -50,7 +56,7 @@ def numbers_of(body: Body, order: str | None) -> Numbers:
 def _lines(path: Path) -> list[str]:
     """Return the joint names of a file, one a line."""
     with suppress(UnicodeDecodeError):
-        lines = (read_regular(path, _MOST_BYTES) or b"").decode().splitlines()
+        lines = (read_regular(path, _MOST_BYTES) or b"").decode("utf-8-sig").splitlines()
         if names := [line.strip() for line in lines if line.strip()]:
             return names
     raise UserError(f"{path} is no list of joints; write their names in your simulator's order, one a line")

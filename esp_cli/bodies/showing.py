@@ -28,6 +28,7 @@ class Layouts:
     action: Continuous  # of each agent
     simulated: Layout  # of positions and velocities, which decide what follows
     orders: dict[PlaneElement, Order]  # of agents, by element that transforms all their numbers alike
+    exact: frozenset[PlaneElement]  # those of which the model is its own image to the last digit
 
 
 def layouts_of(
@@ -57,7 +58,8 @@ def layouts_of(
     ranges = data.model.actuator_ctrlrange[acts[0]]
     unit = f"share of {ranges[0, 0]:g} to {ranges[0, 1]:g}" if np.ptp(ranges, 0).max() == 0 else "share of its range"
     action = Continuous(Layout((replace(parts_field("controls", "actuators", controls, done, 1), unit=unit),)))
-    return Layouts(observation, action, body.state(), orders)
+    exact = frozenset(g for g in orders if body.found[g.name].proof.verdict == "exact")
+    return Layouts(observation, action, body.state(), orders, exact)
 
 
 def _names(body: Body, model: Any) -> list[tuple[str, str]]:

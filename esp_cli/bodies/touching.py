@@ -17,7 +17,8 @@ _OF_A_PAIR = ("friction", "solref", "solimp", "margin", "gap", "dim", "solreffri
 def shape_images(frame: Frame, R: Floats, b: int, c: int) -> list[tuple[int, int, float]]:
     """Return each shape of a moving body that may touch something, its image on another (-1: none), and their gap."""
     own, other = frame.shapes.get(b, []), frame.shapes.get(c, [])
-    contacts = frame.properties("geom", *_OF_A_GEOM)
+    on_world = frame.touching[:, frame.model.body_weldid[frame.model.geom_bodyid] == 0].any(1)
+    contacts = frame.properties("geom", *_OF_A_GEOM) | {"number": frame.touching.sum(1), "world": on_world}
     table = np.ones((len(own), len(other)))
     for row, (g, kind, place, spread) in zip(table, own, strict=True):
         for k, (h, like, there, extent) in enumerate(other):
@@ -40,11 +41,10 @@ def unlike_contacts(frame: Frame, match: Match, wrong: float) -> tuple[str, ...]
             unlike = ["shape"] * (gap > wrong)
             unlike += [what for what, x in contacts.items() if h >= 0 and share(x[g], x[h]) > wrong]
             found += [f"{what} of {_name(frame, g)}" for what in unlike]
-    bodies = np.zeros((model.nbody, model.nbody), dtype=bool)
-    np.logical_or.at(bodies, tuple(model.geom_bodyid[np.array(np.nonzero(frame.touching))]), True)
-    known = [b for b in range(model.nbody) if image[b] >= 0]
-    lost = [(b, c) for b in known for c in known if b < c and bodies[b, c] and not bodies[image[b], image[c]]]
-    found += ["contact of " + " and ".join(printable(frame.name("body", b)) for b in pair) for pair in lost]
+    known = np.flatnonzero(geoms >= 0)
+    lost = frame.touching[np.ix_(known, known)] & ~frame.touching[np.ix_(geoms[known], geoms[known])]
+    apart = sorted({tuple(sorted(model.geom_bodyid[known[list(pair)]].tolist())) for pair in np.argwhere(lost)})
+    found += ["contact of " + " and ".join(printable(frame.name("body", b)) for b in pair) for pair in apart]
     pairs = {frozenset(pair): k for k, pair in enumerate(zip(model.pair_geom1, model.pair_geom2, strict=True))}
     for pair, k in pairs.items():
         other = pairs.get(frozenset(geoms[list(pair)]))

@@ -48,19 +48,28 @@ def turning(actor: Actor, body: Body, numbers: Numbers, rows: Floats | None = No
     """
     seen = numbers[next((name for name in numbers if name != ACTION), ACTION)]
     rows = _drawn(seen) if rows is None else rows
-    if rows.ndim != 2 or rows.shape[1] != seen.width or len(rows) < 2 or not np.isfinite(rows).all():
+    if rows.ndim != 2 or rows.shape[1] != seen.width or not np.isfinite(rows).all():
         raise UserError(f"the rows have shape {list(rows.shape)}; give finite numbers [M, {seen.width}] of states")
-    labels, shifted = labels_of(numbers[ACTION]), np.roll(np.arange(len(rows)), 1)
+    if len(np.unique(rows, axis=0)) < 2:
+        raise UserError("the rows are all the same, so none is unrelated to another; give rows of several states")
+    labels = labels_of(numbers[ACTION])
     here, found = _acted(actor, rows, len(labels)), []
     for element in body.elements:
         there = _acted(actor, rows @ map_of(seen, element).T, len(labels))
         image = here @ map_of(numbers[ACTION], element).T
-        gap, unrelated = ((there - x) ** 2 for x in (image, image[shifted]))
-        shares = np.sqrt(gap.mean(0) / np.maximum(unrelated.mean(0), 1e-30))
+        gap, unrelated = ((there - image) ** 2).mean(0), _between(there, image)
+        shares = np.sqrt(gap / np.maximum(unrelated, 1e-30))
         worst = int(shares.argmax())
         distance = float(np.sqrt(gap.mean() / max(unrelated.mean(), 1e-30)))
         found.append(Turning(element.name, distance, labels[worst], float(shares[worst])))
     return found
+
+
+def _between(here: Floats, there: Floats) -> Floats:
+    """Return the mean square by which each number of a row is off that of any other row, of two arrays [M, A]."""
+    count = len(here)
+    every = here.var(0) + there.var(0) + (here.mean(0) - there.mean(0)) ** 2  # over all pairs, equal ones too
+    return (count * every - ((here - there) ** 2).mean(0)) / (count - 1)
 
 
 def policy_of(name: str) -> Actor:
@@ -109,9 +118,12 @@ def rows_of(path: Path) -> Floats:
 
 
 def _of_tensors(module: Callable[..., Any]) -> Actor:
+    weights = module.parameters() if isinstance(module, torch.nn.Module) else iter(())
+    number = next((weight.dtype for weight in weights if weight.is_floating_point()), torch.float32)
+
     def act(rows: Floats) -> Any:
         with torch.no_grad():
-            given = module(torch.from_numpy(rows).float())
+            given = module(torch.from_numpy(rows).to(number))
         given = given[0] if isinstance(given, tuple | list) else given
         return given.detach().cpu().numpy() if isinstance(given, torch.Tensor) else given
 

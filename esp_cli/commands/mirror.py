@@ -92,6 +92,9 @@ def _write(body: Body, model: Path, order: str | None, host: str, out: Path) -> 
     groups = "; ".join(f"{name}: {layout.summary}" for name, layout in layouts.items())
     console.say(f"{out} has {HOSTS[host]} for {', '.join(body.found)}; {groups}")
     console.note(f"{_proof_of(out)} proves it, with numpy alone")
+    for name, reason in body.refused.items():
+        if reason.startswith("not covered"):
+            console.note(f"it has no {name}, which is {reason}")
     if order is None:
         console.note(
             "the numbers are those of Isaac Lab's velocity tasks, joints in the model's order; --order says yours"
@@ -172,7 +175,9 @@ def _print(body: Body, model: Path) -> None:
     rest = f"but for asymmetries of the model itself ({nearly})" if nearly else "exactly" if not blind else ""
     rest += f"{' and ' if nearly else ''}but for its sensors ({blind})" if blind else ""
     holds = f"is symmetric under {body.group}, {rest}; {len(body.joints)} joints"
-    console.say(f"{model.name} {holds if body.found else 'has no mirror or turn that its accelerations show'}")
+    late = any(reason.startswith("not covered") for reason in body.refused.values())
+    none = "has no mirror or turn that was found" if late else "has no mirror or turn that its accelerations show"
+    console.say(f"{model.name} {holds if body.found else none}")
     for name, one in body.found.items():
         console.say(f"{called[name]}: {one.proof}")
         if one.base is not None and _differs(one.base):

@@ -130,12 +130,21 @@ def test_a_quadruped_has_both_mirrors_and_their_product():
     assert signed(body, "rot180")["hip0"] == "hip3"
 
 
+def around(count: int) -> Body:
+    places = [(0.2 * math.cos(a), 0.2 * math.sin(a), math.degrees(a)) for a in np.arange(count) * 2 * math.pi / count]
+    return body_of(legged(places))
+
+
 @pytest.mark.parametrize("count", [3, 5, 6])
 def test_legs_around_a_trunk_turn_by_their_angle(count):
-    places = [(0.2 * math.cos(a), 0.2 * math.sin(a), math.degrees(a)) for a in np.arange(count) * 2 * math.pi / count]
-    body = body_of(legged(places))
+    body = around(count)
     assert body.group == f"d{count}"
     assert signed(body, f"rot{Fraction(360, count)}")["knee1"] == "knee2"
+
+
+def test_where_not_all_turns_are_tried_the_larger_group_stays():
+    # ten legs have d10, of whose turns those by 1/2 and 1/5 are tried, and no product of the two
+    assert around(10).group == "d5"
 
 
 def test_gymnasiums_ant_turns_by_quarters():
@@ -162,6 +171,27 @@ def test_planar_robots_exchange_legs_that_lie_on_one_line():
     assert signed(body, "flip-x")["thigh_joint"] == "thigh_left_joint"
     assert Body.from_mjcf(GYMNASIUM / "half_cheetah.xml").group == "c1"
     assert signed(Body.from_mjcf(GYMNASIUM / "swimmer.xml"), "flip-x")["motor1_rot"] == "-motor1_rot"
+
+
+_BALL_BASE = "".join(f'<joint type="slide" axis="{a}"/>' for a in ("1 0 0", "0 1 0", "0 0 1")) + '<joint type="ball"/>'
+
+
+@pytest.mark.parametrize("turn", ["0 0 0", "0 0 90"])
+def test_a_base_that_slides_and_turns_without_a_free_joint_sees_along_its_own_axes(turn):
+    text = biped().replace('name="pelvis"', f'name="pelvis" euler="{turn}"')
+    body = body_of(text.replace('<freejoint name="root"/>', _BALL_BASE))
+    assert body.group == "flip-x"
+    model = mujoco.MjModel.from_xml_string(text.replace('<freejoint name="root"/>', _BALL_BASE))
+    match, data, qpos = body.found["flip-x"].match, mujoco.MjData(model), model.qpos0.copy()
+    mujoco.mj_integratePos(model, qpos, np.random.default_rng(0).normal(size=model.nv), 1)
+
+    def seen(q: np.ndarray) -> np.ndarray:
+        data.qpos[:] = q
+        mujoco.mj_kinematics(model, data)
+        return data.xmat[1].reshape(3, 3).T @ [0, 0, -1]
+
+    told = map_of(layout(body.gravity()), LEFT_RIGHT) @ seen(qpos)
+    np.testing.assert_allclose(told, seen(match.qpos @ qpos + match.offset), atol=1e-12)
 
 
 @pytest.mark.parametrize("turn", ["0 0 0", "0 0 90", "0 0 40"])
@@ -344,6 +374,19 @@ def test_what_may_touch_on_one_side_alone_is_not_exact():
     assert excluding("left").verdict == "nearly"
 
 
+def test_a_shape_that_may_not_touch_what_its_image_touches_is_not_exact():
+    def heels(right: str) -> Proof:
+        text, heel = biped(), '<geom type="sphere" size=".01" pos="-0.08 0 -0.03" mass="0" {}/></body>'
+        for side, masks in (("left", 'contype="2" conaffinity="1"'), ("right", right)):
+            at = text.index("</body>", text.index(f'name="{side}_foot"'))
+            text = text[:at] + heel.format(masks) + text[at + len("</body>") :]
+        return body_of(text).found["flip-x"].proof
+
+    assert heels('contype="2" conaffinity="1"').unlike == ()
+    # of either mask it may touch the other leg; the floor has the mask 1
+    assert "contact of world and left_foot" in heels('contype="2" conaffinity="2"').unlike
+
+
 _LIMITS = {
     "force range of left_knee": ('<motor name="a_left_knee" ', '<motor name="a_left_knee" forcerange="-9 9" '),
     "torque range of left_knee": ('<joint name="left_knee" ', '<joint name="left_knee" actuatorfrcrange="-9 9" '),
@@ -365,6 +408,27 @@ def test_a_wall_beside_a_robot_that_is_fixed_is_not_exact():
     assert body_of(arms.format(wall)).found["flip-x"].proof.verdict == "nearly"
 
 
+def test_meshes_touch_with_their_hulls_however_they_are_meshed():
+    def hands(right: str) -> Proof:
+        half = {"big": (0.06, 0.04, 0.02), "small": (0.03, 0.04, 0.02)}
+        corners = {k: [(x, y, z) for x in (-a, a) for y in (-b, b) for z in (-c, c)] for k, (a, b, c) in half.items()}
+        corners["more"] = [*corners["big"], (0.06, 0, 0), (0.06, 0.01, 0.01), (0, 0, 0.02)]  # on its faces
+        assets = "".join(
+            f'<mesh name="{k}" vertex="{" ".join(str(x) for p in own for x in p)}"/>' for k, own in corners.items()
+        )
+        text = biped().replace("<worldbody>", f"<asset>{assets}</asset><worldbody>", 1)
+        text = text.replace('<geom type="plane" size="5 5 1"/>', "").replace('<freejoint name="root"/>', "")
+        for side, y, mesh in (("left", 1, "big"), ("right", -1, right)):
+            hand = f'<geom type="mesh" mesh="{mesh}" pos="0 {0.3 * y} 0.1" mass="0.1"/><body name="{side}_thigh"'
+            text = text.replace(f'<body name="{side}_thigh"', hand)
+        return (
+            body_of(text.replace("</worldbody>", '<geom size="0.1" pos="0 0 1.1"/></worldbody>')).found["flip-x"].proof
+        )
+
+    assert not any("shape" in what for what in hands("big").unlike + hands("more").unlike)
+    assert any(what.startswith("shape of geom") for what in hands("small").unlike)
+
+
 def test_a_turn_that_limits_forbid_is_refused():
     # Front and back hips and knees alike: accelerations are those of d2, but knees bend backward alone.
     place = [(0.2, 0.1, 0), (0.2, -0.1, 0), (-0.2, 0.1, 0), (-0.2, -0.1, 0)]
@@ -383,10 +447,10 @@ def test_two_motors_that_pull_a_joint_opposite_ways_change_places():
     assert body_of(turret).found["flip-x"].match.ctrl.tolist() == [[0, 1], [1, 0]]
 
 
-def test_of_two_free_bodies_the_heavier_is_the_base():
-    ball = '<body name="ball" pos="1 0 0.1"><freejoint/><geom type="sphere" size="0.05"/></body><body name="pelvis"'
-    text = biped().replace('<body name="pelvis"', ball)
-    frame = Frame(mujoco.MjModel.from_xml_string(text))
+@pytest.mark.parametrize("mass", [0.1, 500])
+def test_of_two_free_bodies_the_one_with_joints_is_the_base(mass):
+    box = f'<body pos="1 0 0.1" euler="0 0 90"><freejoint/><geom size="0.05" mass="{mass}"/></body><body name="pelvis"'
+    frame = Frame(mujoco.MjModel.from_xml_string(biped().replace('<body name="pelvis"', box)))
     assert frame.name("joint", frame.base or 0) == "root"
 
 

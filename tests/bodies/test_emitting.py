@@ -191,6 +191,7 @@ def test_hundreds_of_wrong_mirrors_are_caught_and_relabelled_right_ones_never(tm
         ("numbers = lambda body: {'action': 1}", "returns dict"),
         ("numbers = lambda body: {}", "returns dict"),
         ("1 / 0", "cannot import the module 'my_{}' of the function: ZeroDivisionError"),
+        ("numbers = lambda body: {}['hip']", ":numbers raises KeyError: 'hip'; it was given the body"),
     ],
 )
 def test_numbers_that_say_nothing_are_refused(body, tmp_path, monkeypatch, text, words):
@@ -211,6 +212,7 @@ def test_numbers_that_say_nothing_are_refused(body, tmp_path, monkeypatch, text,
         (lambda actions: actions[:, :2], "rows of 9 were given"),
         (lambda actions: actions.abs(), "not a linear map"),
         (lambda actions: 1 / 0, "raises ZeroDivisionError"),
+        (min, "no signature found for builtin .*; give a function of Python that calls it"),
         (lambda obs, actions: 3, r"returns int as observations; return a tensor, or tensors by group \(policy\)"),
         (lambda obs, actions: ({"policy": 3}, actions), "returns dict as observations"),
         (lambda obs, actions: ({}, actions), "returns dict as observations"),
@@ -219,6 +221,26 @@ def test_numbers_that_say_nothing_are_refused(body, tmp_path, monkeypatch, text,
 def test_functions_that_are_no_mirror_are_refused(body, function, words):
     with pytest.raises(UserError, match=words):
         audit(function, body, numbers_of(body, None))
+
+
+def test_a_function_is_called_as_each_version_of_rsl_rl_calls_it(body, tmp_path):
+    tensordict = pytest.importorskip("tensordict")
+    numbers = numbers_of(body, None)
+    right = imported(emitted(body, numbers, "biped"), tmp_path).compute_symmetric_states
+
+    def of_groups(env, obs, actions):
+        made = obs.repeat(2)
+        made["policy"][obs.batch_size[0] :] = right(env, obs["policy"], actions)[0][len(actions) :]
+        return tensordict.TensorDict(made, made.batch_size), right(env, None, actions)[1]
+
+    def passes_on(env, **words):
+        return right(env, words.pop("obs"), **words)
+
+    for function in (of_groups, passes_on):
+        assert [(copy.element, copy.wrong) for copy in audit(function, body, numbers)] == [
+            ("identity", ()),
+            ("flip-x", ()),
+        ]
 
 
 def test_one_tensor_for_several_groups_is_refused(body):

@@ -59,6 +59,23 @@ def test_what_holds_of_the_others(name, symmetry, width):
     assert env.spec.nearly == ("flip-x" if name == "humanoid" else "")
 
 
+def test_a_model_that_is_nearly_its_image_declares_nothing():
+    class Standup(robots.MujocoTask):
+        scenario, convention = "HumanoidStandup-v5", "gymnasium HumanoidStandup-v5"
+
+    assert (made(Standup).spec.symmetry, made(Standup).spec.nearly) == ("c1", "flip-x")
+
+
+def test_agents_of_unlike_numbers_are_refused_in_a_sentence():
+    pytest.importorskip("gymnasium_robotics")
+
+    class Halves(robots.MujocoTeam):
+        scenario, parts, convention, terminates = "Humanoid", "9|8", "mamujoco_v1 Humanoid 9|8", True
+
+    with pytest.raises(UserError, match="agents see or do unlike numbers; give all as many"):
+        made(Halves)
+
+
 @pytest.mark.parametrize("name", ["halfcheetah", "halfcheetah2x3"])
 def test_where_nothing_holds_the_default_is_no_prior(name):
     pytest.importorskip("gymnasium_robotics")

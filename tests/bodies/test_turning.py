@@ -35,8 +35,22 @@ def test_distances_by_hand(pair):
     (found,) = turning(lambda rows: np.ones((len(rows), 2)), body, numbers)
     assert found.distance == pytest.approx(1)
     assert found.action in ("target.left", "target.right")
-    (found,) = turning(lambda rows: rows[:, :2], body, numbers, np.array([[1.0, 2, 0, 0, 1], [3, 4, 0, 0, 1]]))
+    two = np.array([[1.0, 2, 0, 0, 1], [3, 4, 0, 0, 1]])
+    (found,) = turning(lambda rows: rows[:, :2], body, numbers, two)
     assert found.distance == 0
+    # pi(L s) is (-2, 0) and (-4, 0), K pi(s) is (0, -1) and (0, -3): gaps of 4 + 1 and 16 + 9, and of unlike rows of
+    # 4 + 9 and 16 + 1
+    (found,) = turning(lambda rows: rows[:, :2] * [1, 0], body, numbers, two)
+    assert found.distance == pytest.approx((30 / 30) ** 0.5)
+    with pytest.raises(UserError, match="the rows are all the same"):
+        turning(lambda rows: rows[:, :2], body, numbers, np.repeat(two[:1], 3, 0))
+
+
+def test_the_order_of_rows_says_nothing(pair):
+    walk = np.cumsum(np.random.default_rng(0).normal(size=(500, 5)), 0)  # each row is like the one before
+    shuffled = np.random.default_rng(1).permutation(walk)
+    (first,), (second,) = (turning(lambda x: np.tanh(x[:, :2] + [0.3, 0]), *pair, x) for x in (walk, shuffled))
+    assert first.distance == pytest.approx(second.distance)
 
 
 def test_what_has_length_one_has_it(pair):
@@ -68,6 +82,8 @@ def test_files_of_policies_and_rows_are_read_or_refused(tmp_path):
 
     torch.jit.script(Doubled()).save(str(tmp_path / "policy.pt"))
     assert policy_of(str(tmp_path / "policy.pt"))(np.ones((3, 2))).tolist() == [[2, 2]] * 3
+    torch.jit.script(torch.nn.Linear(2, 1).double()).save(str(tmp_path / "double.pt"))
+    assert policy_of(str(tmp_path / "double.pt"))(np.ones((3, 2))).dtype == np.float64
     onnx = pytest.importorskip("onnx")
     pytest.importorskip("onnxruntime")
     for inputs, name in (

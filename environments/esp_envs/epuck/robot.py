@@ -71,8 +71,8 @@ class Arena:
         gap = 4 * self.reach_m * 2 / max(self.num_robots, 1) - 2 * BODY_RADIUS_M
         if self.num_robots > 1 and gap < 0.1:
             raise UserError(
-                f"{self.num_robots} robots do not fit around an arena of {self.side_m:g} m with 10 cm between them; "
-                "make it larger"
+                f"{self.num_robots} robots do not fit around an arena of {self.side_m:g} m with 10 cm of wall between "
+                "them; make it larger"
             )
         ring = PILLAR_RING * self.side_m / 2
         if self.num_pillars and ring + self.pillar_radius_m > self.reach_m - 3 * BODY_RADIUS_M:
