@@ -8,10 +8,12 @@ from pathlib import Path
 
 from esp_cli.defaults import EPISODES, __version__
 from esp_cli.policies.bundled import MANIFEST, MANIFEST_FORMAT, Entry, Score, bundled_folder, read_bundled
-from esp_cli.policies.evaluation import best_seed, evaluate
+from esp_cli.policies.evaluation import best_seed, evaluate, play_references
 from esp_cli.policies.loading import TrainedPolicy, open_policy
 from esp_cli.policies.statistics import normalised
 from esp_cli.training.checkpoint import POLICY_FORMAT, describe_policy, save_checkpoint
+
+SCALE = (0,)  # seeds of the episodes of reference policies, the same for all policies of a task
 
 
 def bundle(trained: TrainedPolicy, name: str, folder: Path, episodes: int = EPISODES) -> Entry:
@@ -21,7 +23,8 @@ def bundle(trained: TrainedPolicy, name: str, folder: Path, episodes: int = EPIS
     found = evaluate(own, episodes)
     spread = found.over_episodes["greedy"]
     score = Score.model_validate({"mean": found.greedy.mean, "episodes": episodes, **vars(spread)})
-    scaled = normalised(score.mean, found.anchors)
+    anchors = play_references(config.model_copy(update={"seeds": SCALE}), found.heuristics, episodes)
+    scaled = normalised(score.mean, {key: float(played.returns.mean()) for key, played in anchors.items()})
     file = folder / f"{name}.safetensors"
     folder.mkdir(parents=True, exist_ok=True)
     described = describe_policy(own.config, own.spec, own.step, [score.mean])
@@ -39,7 +42,7 @@ def bundle(trained: TrainedPolicy, name: str, folder: Path, episodes: int = EPIS
         chosen_from=len(config.seeds),
         step=own.step,
         score=score,
-        normalised=None if scaled is None else float(scaled),
+        normalised=None if scaled is None else round(float(scaled), 4),
         metrics={name: value for name, value in found.metrics.items() if value is not None},
         command=config.command(),
         esp_version=__version__,

@@ -117,7 +117,18 @@ def test_what_is_put_in_is_found_and_plays_the_same(small: Path) -> None:
     assert trained.config.seeds == (entry.seed,)
     found = evaluate(trained, 4)
     assert found.greedy.mean == pytest.approx(entry.score.mean)
-    assert entry.normalised == pytest.approx(float(normalised(entry.score.mean, found.anchors)))
+    # the scale is that of seed 0, which is that of all policies of the task
+    scale = play_references(trained.config.model_copy(update={"seeds": (0,)}), found.heuristics, 4)
+    alike = {name: float(played.returns.mean()) for name, played in scale.items()}
+    assert entry.normalised == pytest.approx(float(normalised(entry.score.mean, alike)), abs=1e-4)
+
+
+def test_bundled_policies_of_one_task_are_ordered_by_their_scores_on_the_scale() -> None:
+    kinds = {(e.task, e.convention, e.algorithm): [] for e in ENTRIES}
+    for entry in ENTRIES:
+        kinds[entry.task, entry.convention, entry.algorithm].append((entry.score.mean, entry.normalised))
+    for pairs in kinds.values():
+        assert [scaled for _, scaled in sorted(pairs)] == sorted(scaled for _, scaled in pairs)
 
 
 def test_the_seed_is_the_one_that_did_best(tmp_path: Path) -> None:
