@@ -15,7 +15,7 @@ from esp_cli.commands.counts import parse_count, parse_seeds
 from esp_cli.commands.options import parse_assignments
 from esp_cli.policies import bundled
 from esp_cli.policies.bundled import MANIFEST, Entry, bundled_folder, find, read_bundled, standard_name
-from esp_cli.policies.evaluation import best_seed, evaluate, play_batches
+from esp_cli.policies.evaluation import best_seed, evaluate, play_batches, play_references
 from esp_cli.policies.loading import open_policy
 from esp_cli.policies.statistics import mean_and_sem, normalised
 from esp_cli.training.build import PolicyController
