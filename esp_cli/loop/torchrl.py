@@ -16,7 +16,6 @@ from torchrl.envs.transforms import Transform as TorchRLTransform
 from torchrl.objectives import LossModule
 
 from esp_cli.loop.divergence import Policy, policy_divergence
-from esp_cli.loop.shapes import carry
 from esp_cli.loop.symmetry import Symmetry
 from esp_cli.loop.tensordicts import Role, with_copies
 from esp_cli.prior.losses import value_consistency_loss
@@ -85,9 +84,7 @@ class SymmetricLoss(nn.Module):
         """Return the losses of data [B, ...], consistency inside, "policy_symmetry" and "value_symmetry" beside."""
         if not self.augment and not self.coefficient:
             return self.loss(tensordict)
-        parts, transforms = with_copies(
-            self.symmetry.spaces, self._needed(tensordict), self.symmetry.transforms, self.roles
-        )
+        parts, transforms = with_copies(self._needed(tensordict), self.symmetry.transforms, self.roles)
         batches: list[Any] = [torch.cat(parts, 0)] if self.augment else parts
         size = len(tensordict)
         answers = [self._ask(batch, size) for batch in batches]
@@ -100,8 +97,7 @@ class SymmetricLoss(nn.Module):
             gaps["policy"] = [policy_divergence(g, p, here) for g, p in zip(transforms, there, strict=True)]
         own, *moved = (value for _, _, values in answers for value in values)
         gaps["value"] = [
-            value_consistency_loss(carry(self.symmetry.spaces, g.values, v, tensordict.batch_size, "the value"), own)
-            for g, v in zip(transforms, moved, strict=True)
+            value_consistency_loss(g.values(v, "the value"), own) for g, v in zip(transforms, moved, strict=True)
         ]
         for name, gap in gaps.items():
             mean = torch.stack(gap).mean()

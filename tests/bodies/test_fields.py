@@ -46,7 +46,8 @@ def walker(body: Body, history: int = 1) -> Symmetry:
 
 def moved(field: Field, element: str, row: list[float]) -> list[float]:
     symmetry = Symmetry(observation=layout(field), action=Continuous(layout(Field("a", VECTOR_3D))), group=element)
-    return symmetry.transforms(torch.zeros(1).double())[0].obs(torch.tensor([row], dtype=torch.float64))[0].tolist()
+    obs = torch.tensor([row], dtype=torch.float64)
+    return symmetry.transforms(obs)[0].obs(obs)[0].tolist()
 
 
 @pytest.mark.parametrize(
