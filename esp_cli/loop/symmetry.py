@@ -84,12 +84,7 @@ class Symmetry(Draws):
 
     @torch.inference_mode(False)  # as what is kept serves training too
     def transforms(self, obs: Tensor, lead: torch.Size | None = None) -> list[CheckedTransform]:
-        """Return the elements of one call, for data with these observations: one that is drawn, or all.
-
-        Args:
-            obs: [..., N, D]; their device is that of the elements.
-            lead: the leading axes `...`, where `obs` is another tensor of the data.
-        """
+        """Return the elements of one call, one drawn or all, for data [*lead, ...] with observations [*lead, N, D]."""
         lead = lead_of(self.spaces, obs) if lead is None else lead
         chosen = self._set(obs.device, torch.float64 if obs.dtype == torch.float64 else torch.float32)
         drawn = chosen.each() if self.copies == "all" else [chosen.draw([self.generator])]
@@ -133,8 +128,7 @@ class Symmetry(Draws):
         def joined(x: Tensor, images: list[Tensor]) -> Tensor:
             return torch.cat([x, *images], dim)
 
-        moved_action = [g.action(action) for g in transforms]
-        parts = [joined(obs, [g.obs(obs) for g in transforms]), joined(action, moved_action)]
+        parts = [joined(obs, [g.obs(obs) for g in transforms]), joined(action, [g.action(action) for g in transforms])]
         if state is not None:
             check_state(self.spaces, state, lead)
             parts.append(joined(state, [g.state(state) for g in transforms]))
@@ -223,8 +217,8 @@ class Symmetry(Draws):
         else:
             raise UserError("value_loss takes either state or obs; give the one that the critic sees")
         here = value(data) if here is None else here
-        moved = [(g, value(g.obs(data) if state is None else g.state(data))) for g in self.transforms(data, lead)]
-        carried = [g.values(x) for g, x in moved]
+        transforms = self.transforms(data, lead)
+        carried = [g.values(value(g.obs(data) if state is None else g.state(data))) for g in transforms]
         check_alike("value", carried, here)
         return mean_counted([value_consistency_loss(x, here) for x in carried], mask)
 
