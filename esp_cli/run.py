@@ -12,9 +12,10 @@ from __future__ import annotations
 import itertools
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from numbers import Integral
+from operator import index
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -236,14 +237,19 @@ def train(
     Raises:
         UserError: an unknown name, a value out of range, choices that do not go together, or a folder that is taken.
     """
+    if settings is not None and not (isinstance(settings, Mapping) and all(isinstance(s, str) for s in settings)):
+        raise UserError(f'settings are {settings!r}; give values by dotted name, as {{"task.num_agents": 4}}')
     named = (settings or {}).get("network.name")
     register_own(None, None, named if isinstance(named, str) else None)
     name, algorithm = register(task), ALGORITHMS.register(algo)
-    if isinstance(seeds, int):
+    if isinstance(seeds, Integral):
         raise UserError(f"seeds are the numbers of the seeds, not how many; write seeds=range({seeds})")
+    numbers = tuple(seeds) if isinstance(seeds, Iterable) else (seeds,)
+    if not all(isinstance(seed, Integral) for seed in numbers):
+        raise UserError(f"seeds are whole numbers, not {seeds!r}; write for example seeds=range(10) or seeds=(3, 7)")
     if not isinstance(steps, Integral):
         raise UserError(f"steps are a whole number, not {steps!r}; write for example steps=100_000")
-    asked = resolve_config(name, algorithm, preset, steps, seeds, resolve_device(device), settings)
+    asked = resolve_config(name, algorithm, preset, index(steps), numbers, resolve_device(device), settings)
     config, weights = plan(asked, init_from)
     require(track)
     run = begin(config, weights, out)

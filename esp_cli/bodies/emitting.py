@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pprint
 from collections.abc import Mapping, Sequence
+from copy import copy
 from importlib.abc import Loader
 from importlib.util import module_from_spec
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 
 from esp_cli.bodies import proven, written
 from esp_cli.bodies.body import Body
+from esp_cli.bodies.kinds import PartsKind
 from esp_cli.bodies.numbers import ACTION, Numbers, labels_of, map_of
 from esp_cli.defaults import __version__
 from esp_cli.symmetry.elements import Floats
@@ -27,6 +29,18 @@ HOSTS |= {"skrl": "augment", "sb3": "augment", "numpy": "mirrored"}
 """Loops, and the function of the file that they call."""
 
 
+def carried(body: Body, numbers: Numbers) -> Body:
+    """Return the body with those elements alone that all numbers carry: a scan may carry fewer than the body has."""
+    kinds = [field.kind for layout in numbers.values() for field in layout.fields]
+    moves = [dict(kind.moves) for kind in kinds if isinstance(kind, PartsKind)]
+    own = copy(body)
+    own.elements = tuple(element for element in body.elements if all(element in by for by in moves))
+    if body.elements and not own.elements:
+        raise UserError(f"the numbers carry no element of {body.group} together; leave a field of points out")
+    own.found = {element.name: body.found[element.name] for element in own.elements if element.name in body.found}
+    return own
+
+
 def emitted(body: Body, numbers: Numbers, model: str) -> str:
     """Return the source of a file with the mirrors of a model's observations and actions, as `written` has them."""
     return _filled(written, _data(body, numbers, model, body.elements))
@@ -35,13 +49,18 @@ def emitted(body: Body, numbers: Numbers, model: str) -> str:
 def mirror_of(body: Body, numbers: Numbers, group: str | None = None) -> ModuleType:
     """Return what an `emitted` file would be once imported, without one: ELEMENTS, `mirrored`, `augment` and others.
 
-    Its `group` are the elements that leave your reward alone, such as "left-right"; by default all that the body has. A
-    body without a symmetry, or without an element of the group, is a UserError.
+    Its `group` are the elements that leave your reward alone, such as "left-right"; by default all that the body has
+    and the numbers carry. A body without a symmetry, or without an element of the group, is a UserError.
     """
+    body = carried(body, numbers)
     wanted = body.elements
     if group is not None:
-        parsed = list(map(PlaneElement.of, parse_elements(group, 1)))  # type: ignore[arg-type] # finite
-        wanted = tuple(element for element in parsed if element != PlaneElement())
+        parsed = parse_elements(group, 1)
+        if not isinstance(parsed, tuple) or any(element.orders for element in parsed):
+            raise UserError(
+                f"'{group}' is no list of turns and mirrors; write some of {', '.join(g.name for g in wanted)}"
+            )
+        wanted = tuple(element for element in map(PlaneElement.of, parsed) if element != PlaneElement())
         if missing := [element.name for element in wanted if element not in body.elements]:
             raise UserError(f"the body has no {missing[0]}; its group is {body.group}")
     module = module_from_spec(written.__spec__)

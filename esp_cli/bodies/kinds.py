@@ -108,11 +108,11 @@ def points_field(
     Args:
         name: of the field.
         points: [n, 2] or [n, 3], where they are seen from the body, m; or the directions of rays.
-        elements: those that the body has; each must send points to points.
+        elements: those that the body has; the field carries those that send points to points.
         count: how many such pictures: steps of a history.
 
     Raises:
-        UserError: a point's image is no point.
+        UserError: no element sends points to points.
     """
     try:
         places = np.asarray(points, dtype=np.float64)
@@ -120,14 +120,18 @@ def points_field(
         places = np.zeros(0)
     if places.ndim != 2 or places.shape[1] not in (2, 3) or not len(places) or not np.isfinite(places).all():
         raise UserError(f"field '{name}': points have shape {list(places.shape)}; give [n, 2] or [n, 3] finite numbers")
-    size, moves = max(np.abs(places).max(), 1e-9), {}
+    size, moves, refusal = max(np.abs(places).max(), 1e-9), {}, ""
     for element in elements:
         turn = space(element.matrix)[: places.shape[1], : places.shape[1]]
         gap = np.abs((places @ turn.T)[:, None] - places).max(-1) / size
-        moves[element] = (gap < 1e-3).T.astype(np.float64)
-        if not (moves[element].sum(0) == 1).all():
+        matrix = (gap < 1e-3).T.astype(np.float64)
+        if (matrix.sum(0) == 1).all():
+            moves[element] = matrix
+        else:
             k = int(gap.min(1).argmax())
-            raise UserError(f"field '{name}': the image of point {k} under {element.name} is no point, or several")
+            refusal = refusal or f"the image of point {k} under {element.name} is no point, or several"
+    if refusal and not moves:
+        raise UserError(f"field '{name}': {refusal}")
     return parts_field(name, "points", [str(k) for k in range(len(places))], moves, count)
 
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from esp_cli.bodies import Body
     from esp_cli.bodies.auditing import Copy
     from esp_cli.bodies.finding import Difference
+    from esp_cli.bodies.numbers import Numbers
     from esp_cli.bodies.turning import Turning
 
 EPILOG = """Examples:\n
@@ -87,6 +88,7 @@ def _write(body: Body, model: Path, order: str | None, host: str, out: Path) -> 
     from esp_cli.files.writing import write_file
 
     layouts = numbers_of(body, order)
+    body = _carried(body, layouts)
     write_file(out, emitted(body, layouts, model.name).encode())
     write_file(_proof_of(out), proof(body, layouts, out.name).encode())
     groups = "; ".join(f"{name}: {layout.summary}" for name, layout in layouts.items())
@@ -99,6 +101,16 @@ def _write(body: Body, model: Path, order: str | None, host: str, out: Path) -> 
         console.note(
             "the numbers are those of Isaac Lab's velocity tasks, joints in the model's order; --order says yours"
         )
+
+
+def _carried(body: Body, numbers: Numbers) -> Body:
+    """Return the body with the elements that all numbers carry, and name those that are left out."""
+    from esp_cli.bodies.emitting import carried
+
+    own = carried(body, numbers)
+    if left := [element.name for element in body.elements if element not in own.elements]:
+        console.note(f"left out, as not all numbers carry them: {', '.join(left)}")
+    return own
 
 
 def _proof_of(out: Path) -> Path:
@@ -131,6 +143,7 @@ def check_robot(
         why = "".join(f" ({element}: {reason})" for element, reason in list(body.refused.items())[:1])
         raise UserError(f"{model} has no mirror or turn{why}, so {name} cannot be compared with one")
     numbers, found = numbers_of(body, order), {"model": str(model), "group": body.group}
+    body = _carried(body, numbers)
     if what == "mirror":
         copies = audit(import_function(name), body, numbers)
         console.result(json, {**found, "copies": copies}, lambda: _print_audit(name, copies))

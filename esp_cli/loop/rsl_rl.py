@@ -48,7 +48,8 @@ def data_augmentation_func(body: Body, numbers: Numbers, group: str | None = Non
     Args:
         body: of the robot.
         numbers: layouts of the observation groups by name, and of "action".
-        group: the elements that leave your reward alone, such as "left-right"; by default all that the body has.
+        group: the elements that leave your reward alone, such as "left-right"; by default all that the body has and the
+            numbers carry.
 
     Raises:
         UserError: the body has no symmetry, or lacks an element of the group.

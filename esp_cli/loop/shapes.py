@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, fields
 from typing import Any, cast
 
 import torch
@@ -81,51 +82,70 @@ def check_state(spaces: Spaces, state: Tensor, lead: torch.Size | None = None) -
     return _check_rows("state", state, spaces.state, lead)
 
 
-def act(spaces: Spaces, transform: Transform, action: Tensor, lead: torch.Size) -> Tensor:
-    """Return K_g a; shapes as of `augment`."""
-    _check_tensor("action", action)
-    space, axes, shape = spaces.action, (*lead, *_agents(spaces)), list(action.shape)
-    if not isinstance(space, Discrete):
-        if action.shape != (*axes, space.width):
-            raise UserError(f"the action has shape {shape}, but {[*axes, space.width]} is needed")
-        if not action.is_floating_point():
-            raise UserError(f"the action is {action.dtype}; give floating-point numbers")
-        return transform.action(action)
-    if action.shape == (*axes, space.count) and space.count > 1:
-        return transform.push_outputs(action)
-    if action.shape not in (axes, (*axes, 1)):
-        raise UserError(f"the action has shape {shape}, but {list(axes)} is needed, or one-hot with {space.count}")
-    if action.is_floating_point() or action.is_complex() or action.dtype == torch.bool:
-        raise UserError(f"the action is {action.dtype}, but indices of {space.count} actions are integers")
-    low, high = torch.aminmax(action) if action.numel() else (0, 0)
-    if low < 0 or high >= space.count:
-        outside = int(low if low < 0 else high)
-        raise UserError(f"the action {outside} is outside of the {space.count} actions, 0 to {space.count - 1}")
-    return transform.action(action.reshape(axes).long()).reshape(action.shape).to(action.dtype)
+@dataclass(frozen=True)
+class CheckedTransform(Transform):
+    """A transform of the data of one call, with their leading axes: it takes the shapes of `augment` and no others."""
+
+    lead: torch.Size
+
+    def action(self, action: Tensor) -> Tensor:
+        """Return K_g a, of indices [..., N], [..., N, 1] or one-hot [..., N, A], or continuous actions."""
+        check_tensor("action", action)
+        space, axes, shape = self.spaces.action, (*self.lead, *_agents(self.spaces)), list(action.shape)
+        if not isinstance(space, Discrete):
+            if action.shape != (*axes, space.width):
+                raise UserError(f"the action has shape {shape}, but {[*axes, space.width]} is needed")
+            if not action.is_floating_point():
+                raise UserError(f"the action is {action.dtype}; give floating-point numbers")
+            return super().action(action)
+        if action.shape == (*axes, space.count) and space.count > 1:
+            return self.push_outputs(action)
+        if action.shape not in (axes, (*axes, 1)):
+            raise UserError(f"the action has shape {shape}, but {list(axes)} is needed, or one-hot with {space.count}")
+        if action.is_floating_point() or action.is_complex() or action.dtype == torch.bool:
+            raise UserError(f"the action is {action.dtype}, but indices of {space.count} actions are integers")
+        indices = action.long()
+        low, high = torch.aminmax(indices) if action.numel() else (0, 0)
+        if low < 0 or high >= space.count:
+            outside = int(low if low < 0 else high)
+            raise UserError(f"the action {outside} is outside of the {space.count} actions, 0 to {space.count - 1}")
+        return super().action(indices.reshape(axes)).reshape(action.shape).to(action.dtype)
+
+    def per_agent(self, x: Tensor, name: str = "per_agent") -> Tensor:
+        """Let a number per agent, [..., N] or [..., N, 1], move with it; one per row, [...] or [..., 1], stays."""
+        return self._carried(super().per_agent, x, name)
+
+    def values(self, values: Tensor, name: str = "value") -> Tensor:
+        """Return values per agent, [..., N] or [..., N, 1], to their agents; one per row stays."""
+        return self._carried(super().values, values, name)
+
+    def along(self, x: Tensor, name: str) -> Tensor:
+        """Move what goes with its agent: a number as by `per_agent`, or an action mask."""
+        check_tensor(name, x)
+        space = self.spaces.action
+        masks = (*self.lead, *_agents(self.spaces), space.count) if isinstance(space, Discrete) else (1,)
+        if masks[-1] > 1 and x.shape == masks:
+            if x.dtype != torch.bool:
+                raise UserError(f"{name} is {x.dtype}, but an action mask is torch.bool; give mask.bool()")
+            return self.push_outputs(x)
+        return self.per_agent(x, name)
+
+    def _carried(self, move: Callable[[Tensor], Tensor], x: Tensor, name: str) -> Tensor:
+        check_tensor(name, x)
+        lead, tail = self.lead, x.shape[len(self.lead) :]
+        agents = (*lead, *_agents(self.spaces))
+        if x.shape[: len(lead)] == lead and tail.numel() == 1:
+            return x
+        if x.shape in (agents, (*agents, 1)):
+            return move(x.reshape(agents)).reshape(x.shape)
+        reason = f"; {HIDDEN}" if x.shape[: len(agents)] == agents else ""
+        needed = " or ".join(dict.fromkeys(str(list(shape)) for shape in (agents, lead)))
+        raise UserError(f"{name} has shape {list(x.shape)}, but {needed} is needed{reason}")
 
 
-def carry(spaces: Spaces, move: Callable[[Tensor], Tensor], x: Tensor, lead: torch.Size, name: str) -> Tensor:
-    """Move numbers with their agents, by `Transform.per_agent` or `Transform.values`; shapes as of `augment`."""
-    _check_tensor(name, x)
-    agents, tail = (*lead, *_agents(spaces)), x.shape[len(lead) :]
-    if x.shape[: len(lead)] == lead and tail.numel() == 1:
-        return x
-    if x.shape in (agents, (*agents, 1)):
-        return move(x.reshape(agents)).reshape(x.shape)
-    reason = f"; {HIDDEN}" if x.shape[: len(agents)] == agents else ""
-    needed = " or ".join(dict.fromkeys(str(list(shape)) for shape in (agents, lead)))
-    raise UserError(f"{name} has shape {list(x.shape)}, but {needed} is needed{reason}")
-
-
-def carry_along(spaces: Spaces, transform: Transform, x: Tensor, lead: torch.Size, name: str) -> Tensor:
-    """Move what goes with its agent: a number as by `carry`, or an action mask."""
-    _check_tensor(name, x)
-    space = spaces.action
-    if isinstance(space, Discrete) and x.shape == (*lead, *_agents(spaces), space.count) and space.count > 1:
-        if x.dtype != torch.bool:
-            raise UserError(f"{name} is {x.dtype}, but an action mask is torch.bool; give mask.bool()")
-        return transform.push_outputs(x)
-    return carry(spaces, transform.per_agent, x, lead, name)
+def checked(transform: Transform, lead: torch.Size) -> CheckedTransform:
+    """Return a transform for data with these leading axes."""
+    return CheckedTransform(**{field.name: getattr(transform, field.name) for field in fields(transform)}, lead=lead)
 
 
 def check_mask(spaces: Spaces, mask: Tensor | None, lead: torch.Size) -> None:
@@ -137,6 +157,12 @@ def check_mask(spaces: Spaces, mask: Tensor | None, lead: torch.Size) -> None:
     shape = [*lead, *_agents(spaces), spaces.action.count]
     if list(mask.shape) != shape or mask.dtype != torch.bool:
         raise UserError(f"the action mask is {mask.dtype} {list(mask.shape)}, but torch.bool {shape} is needed")
+
+
+def check_tensor(name: str, x: object) -> None:
+    """Refuse what is no tensor."""
+    if not isinstance(x, Tensor):
+        raise UserError(f"{name} is of type {type(x).__name__}; give a tensor")
 
 
 def check_alike(name: str, moved: Iterable[Tensor], here: Tensor) -> None:
@@ -177,7 +203,7 @@ def _check_rows(
     name: str, x: Tensor, layout: Layout, lead: torch.Size | None = None, agents: tuple[int, ...] = ()
 ) -> torch.Size:
     """Return the leading axes of rows [..., *agents, width] after checking that they are that."""
-    _check_tensor(name, x)
+    check_tensor(name, x)
     cut = x.dim() - 1 - len(agents)
     found = x.shape[: max(cut, 0)]
     if x.shape[-1:] != (layout.width,):
@@ -190,11 +216,6 @@ def _check_rows(
     if not x.is_floating_point():
         raise UserError(f"{name} is {x.dtype}; give floating-point numbers")
     return found
-
-
-def _check_tensor(name: str, x: object) -> None:
-    if not isinstance(x, Tensor):
-        raise UserError(f"{name} is of type {type(x).__name__}; give a tensor")
 
 
 def _agents(spaces: Spaces) -> tuple[int, ...]:

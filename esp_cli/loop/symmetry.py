@@ -13,10 +13,10 @@ from torch import Tensor
 
 from esp_cli.loop import shapes
 from esp_cli.loop.divergence import Policy, policy_divergence
-from esp_cli.loop.shapes import Augmented, Draws, carry, carry_along, check_alike, check_state, lead_of, mean_counted
+from esp_cli.loop.shapes import Augmented, CheckedTransform, Draws, check_alike, check_state, lead_of, mean_counted
 from esp_cli.loop.tensordicts import Role, with_copies
 from esp_cli.prior.losses import value_consistency_loss
-from esp_cli.symmetry import Transform, TransformSet
+from esp_cli.symmetry import TransformSet
 from esp_cli.symmetry.admission import admitted_elements, unrestricted
 from esp_envs.errors import UserError
 from esp_envs.spec import ActionSpace, Discrete, Layout, Spaces, joint_layout
@@ -83,10 +83,12 @@ class Symmetry(Draws):
             raise UserError(f"copies='all' needs a finite group, but '{group}' is infinite or large; use copies='draw'")
 
     @torch.inference_mode(False)  # as what is kept serves training too
-    def transforms(self, like: Tensor) -> list[Transform]:
-        """Return the elements of one call, on the device of `like`: one that is drawn, or all."""
-        chosen = self._set(like.device, torch.float64 if like.dtype == torch.float64 else torch.float32)
-        return chosen.each() if self.copies == "all" else [chosen.draw([self.generator])]
+    def transforms(self, obs: Tensor, lead: torch.Size | None = None) -> list[CheckedTransform]:
+        """Return the elements of one call, one drawn or all, for data [*lead, ...] with observations [*lead, N, D]."""
+        lead = lead_of(self.spaces, obs) if lead is None else lead
+        chosen = self._set(obs.device, torch.float64 if obs.dtype == torch.float64 else torch.float32)
+        drawn = chosen.each() if self.copies == "all" else [chosen.draw([self.generator])]
+        return [shapes.checked(g, lead) for g in drawn]
 
     def augment(
         self,
@@ -126,15 +128,11 @@ class Symmetry(Draws):
         def joined(x: Tensor, images: list[Tensor]) -> Tensor:
             return torch.cat([x, *images], dim)
 
-        moved_action = [shapes.act(self.spaces, g, action, lead) for g in transforms]
-        parts = [joined(obs, [g.obs(obs) for g in transforms]), joined(action, moved_action)]
+        parts = [joined(obs, [g.obs(obs) for g in transforms]), joined(action, [g.action(action) for g in transforms])]
         if state is not None:
             check_state(self.spaces, state, lead)
             parts.append(joined(state, [g.state(state) for g in transforms]))
-        numbers = (
-            joined(x, [carry_along(self.spaces, g, x, lead, f"per_agent[{i}]") for g in transforms])
-            for i, x in enumerate(per_agent)
-        )
+        numbers = (joined(x, [g.along(x, f"per_agent[{i}]") for g in transforms]) for i, x in enumerate(per_agent))
         return Augmented((*parts, tuple(numbers)))
 
     def augment_tensordict(self, data: Any, roles: Mapping[str, Role] | None = None) -> Any:
@@ -153,7 +151,7 @@ class Symmetry(Draws):
         Raises:
             UserError: the numbers under a key do not fit, or have no role.
         """
-        parts, _ = with_copies(self.spaces, data, self.transforms, roles)
+        parts, _ = with_copies(data, self.transforms, roles)
         axes = [axis for axis, name in enumerate(data.names) if name != "time"]
         return torch.cat(parts, axes[0]) if axes else torch.stack(parts)
 
@@ -219,8 +217,8 @@ class Symmetry(Draws):
         else:
             raise UserError("value_loss takes either state or obs; give the one that the critic sees")
         here = value(data) if here is None else here
-        moved = [(g, value(g.obs(data) if state is None else g.state(data))) for g in self.transforms(data)]
-        carried = [carry(self.spaces, g.values, x, lead, "value") for g, x in moved]
+        transforms = self.transforms(data, lead)
+        carried = [g.values(value(g.obs(data) if state is None else g.state(data))) for g in transforms]
         check_alike("value", carried, here)
         return mean_counted([value_consistency_loss(x, here) for x in carried], mask)
 
@@ -268,9 +266,11 @@ class Symmetry(Draws):
                 f"there is nothing to check in {type(source).__name__}; give a task, or Transitions(obs, ...)"
             )
         data = source if isinstance(source, Transitions) else collect(source)
-        if self.spaces.num_agents == 1 and data.reward.dim() == 2:
+        for name, part in vars(data).items():
+            if part is not None:
+                shapes.check_tensor(name, part)
+        if len(lead_of(self.spaces, data.obs)) == 2 and self.spaces.num_agents == 1:
             data = data.map(lambda x: x.unsqueeze(2))
-        lead_of(self.spaces, data.obs if self.spaces.num_agents > 1 else data.obs.squeeze(2))
         spaces = replace(self.spaces, symmetry=self.group)
         return check_transitions(spaces, data, candidates(spaces, transforms or self.group))
 

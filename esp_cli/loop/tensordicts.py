@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from itertools import count
 from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
 
-from esp_cli.loop.shapes import act, carry, check_state, lead_of
-from esp_cli.symmetry import Transform
+from esp_cli.loop.shapes import CheckedTransform, check_state, lead_of
 from esp_envs.errors import UserError
-from esp_envs.spec import Spaces
 
 # what the numbers under a key are: rows of a layout, actions (or one number per action), ids of trajectories, of which
 # each copy has its own, unchanged, left out
@@ -38,12 +37,14 @@ Other keys hold numbers that go with their agents, or one for each row (rewards,
 
 
 def with_copies(
-    spaces: Spaces, data: Any, choose: Callable[[Tensor], list[Transform]], roles: Mapping[str, Role] | None = None
-) -> tuple[list[Any], list[Transform]]:
+    data: Any,
+    choose: Callable[[Tensor, torch.Size], list[CheckedTransform]],
+    roles: Mapping[str, Role] | None = None,
+) -> tuple[list[Any], list[CheckedTransform]]:
     """Return the data, less what is dropped, with its copies behind it, and the element of each copy.
 
-    The TensorDict [B, ...] has agents in nested groups or not, also below "next". `choose` returns the elements for a
-    device, and `roles` are of keys by their last part, where they differ from `ROLES`.
+    The TensorDict [B, ...] has agents in nested groups or not, also below "next". `choose` returns the elements for
+    a tensor's device and leading axes, and `roles` are of keys by their last part, where they differ from `ROLES`.
     """
     named: Mapping[str, Role] = {**ROLES, **(roles or {})}
     if unknown := next((part for part, role in named.items() if role not in get_args(Role)), None):
@@ -55,22 +56,20 @@ def with_copies(
     if not seen:
         names = ", ".join(".".join(path) for path in leaves)
         raise UserError(f"no key of the TensorDict is an observation or a state; name its role, it has {names}")
-    transforms, copies = choose(seen[0]), []
+    transforms, copies = choose(seen[0], data.batch_size), []
     for transform in transforms:
         copy, first_id = data.clone(False), -(next(_COPY_NUMBERS) << 32)
         for path, value in kept.items():
             role = named.get(path[-1])
-            if role == "trajectory":
-                moved = value.long() + first_id  # below 0, where no trajectory of a collector is
-            else:
-                moved = _moved(spaces, transform, value, role, data.batch_size, ".".join(path))
-            copy.set(path, moved)
+            own = role == "trajectory"  # below 0, where no trajectory of a collector is
+            copy.set(path, value.long() + first_id if own else _moved(transform, value, role, ".".join(path)))
         copies.append(copy)
     return [data, *copies], transforms
 
 
-def _moved(spaces: Spaces, transform: Transform, x: Tensor, role: Role | None, lead: torch.Size, name: str) -> Tensor:
+def _moved(transform: CheckedTransform, x: Tensor, role: Role | None, name: str) -> Tensor:
     """Return the numbers of one key in a copy."""
+    spaces, lead = transform.spaces, transform.lead
     try:
         if role == "observation":
             lead_of(spaces, x)
@@ -81,8 +80,8 @@ def _moved(spaces: Spaces, transform: Transform, x: Tensor, role: Role | None, l
         if role == "action":
             # a group of one agent has an agent axis all the same
             alone = spaces.num_agents == 1 and x.shape[len(lead) : -1] == (1,)
-            return act(spaces, transform, x, torch.Size((*lead, 1)) if alone else lead)
-        return x if role == "same" else carry(spaces, transform.per_agent, x, lead, "it")
+            return (replace(transform, lead=torch.Size((*lead, 1))) if alone else transform).action(x)
+        return x if role == "same" else transform.per_agent(x, "it")
     except UserError as error:
         advice = "" if role else "; name its role, 'same' or 'drop' for example"
         raise UserError(f"the key {name} of the TensorDict does not fit: {error}{advice}") from None

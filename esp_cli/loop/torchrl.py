@@ -1,7 +1,7 @@
 """TorchRL: copies in a replay buffer or collector, and a loss with the prior around `ClipPPOLoss` and its like.
 
 symmetry = Symmetry(observation=layout(...), action=discrete_moves(4), group="d4", num_agents=3)
-loss = SymmetricLoss(MAPPOLoss(actor, critic), symmetry, coefficient=0.1)
+loss = SymmetricLoss(ClipPPOLoss(actor, critic), symmetry, coefficient=0.1)
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs.transforms import Transform as TorchRLTransform
-from torchrl.objectives import LossModule
+from torchrl.objectives import A2CLoss, KLPENPPOLoss, LossModule, PPOLoss
+from torchrl.objectives.multiagent import QMixerLoss
 
 from esp_cli.loop.divergence import Policy, policy_divergence
-from esp_cli.loop.shapes import carry
 from esp_cli.loop.symmetry import Symmetry
 from esp_cli.loop.tensordicts import Role, with_copies
 from esp_cli.prior.losses import value_consistency_loss
@@ -50,9 +50,9 @@ _TERMS = {"policy": "loss_objective", "value": "loss_critic"}  # which loss of P
 class SymmetricLoss(nn.Module):
     """A loss of TorchRL with both parts of the prior: copies of its data, and consistency (Eq. 10).
 
-    Around `ClipPPOLoss`, `MAPPOLoss` and `IPPOLoss`, S_pi (Eq. 8) is added to "loss_objective" and S_V (Eq. 9) to
-    "loss_critic". Around `QMixerLoss`, S_Q of the mixed value (supplement eq. 19) is added to "loss". The networks are
-    asked once: what they say of the originals and of the copies is taken from the loss's own pass.
+    Around `ClipPPOLoss`, `MAPPOLoss`, `IPPOLoss` and `A2CLoss`, S_pi (Eq. 8) is added to "loss_objective" and S_V
+    (Eq. 9) to "loss_critic". Around `QMixerLoss`, S_Q of the mixed value (supplement eq. 19) is added to "loss". The
+    networks are asked once: what they say of the originals and of the copies is taken from the loss's own pass.
 
     Args:
         loss: any of these, its keys set.
@@ -63,7 +63,7 @@ class SymmetricLoss(nn.Module):
         roles: of keys by their last part, where they differ from `esp_cli.loop.tensordicts.ROLES`.
 
     Raises:
-        UserError: the loss is of another kind.
+        UserError: the loss is of another kind, or a sum over rows.
     """
 
     def __init__(
@@ -75,9 +75,13 @@ class SymmetricLoss(nn.Module):
         roles: Mapping[str, Role] | None = None,
     ) -> None:
         super().__init__()
-        self.mixes = hasattr(loss, "mixer_network")
-        if not self.mixes and not (hasattr(loss, "actor_network") and hasattr(loss, "critic_network")):
-            raise UserError(f"{type(loss).__name__} is not known; give a loss of PPO's family, or QMixerLoss")
+        self.mixes = isinstance(loss, QMixerLoss)
+        # the penalty on KL needs what the policy said before, which copies do not have
+        if isinstance(loss, KLPENPPOLoss) or not isinstance(loss, PPOLoss | A2CLoss | QMixerLoss):
+            known = "ClipPPOLoss, MAPPOLoss, IPPOLoss, A2CLoss or QMixerLoss"
+            raise UserError(f"{type(loss).__name__} is not known; give {known}")
+        if getattr(loss, "reduction", None) == "sum":
+            raise UserError("the loss is a sum over rows, but consistency is a mean; give it reduction='mean'")
         self.loss, self.symmetry, self.coefficient = loss, symmetry, coefficient
         self.augment, self.roles = augment, roles
 
@@ -85,9 +89,9 @@ class SymmetricLoss(nn.Module):
         """Return the losses of data [B, ...], consistency inside, "policy_symmetry" and "value_symmetry" beside."""
         if not self.augment and not self.coefficient:
             return self.loss(tensordict)
-        parts, transforms = with_copies(
-            self.symmetry.spaces, self._needed(tensordict), self.symmetry.transforms, self.roles
-        )
+        if not tensordict.batch_dims or not len(tensordict):
+            raise UserError(f"the data have batch_size {list(tensordict.batch_size)}; give [B, ...] of one row or more")
+        parts, transforms = with_copies(self._needed(tensordict), self.symmetry.transforms, self.roles)
         batches: list[Any] = [torch.cat(parts, 0)] if self.augment else parts
         size = len(tensordict)
         answers = [self._ask(batch, size) for batch in batches]
@@ -100,8 +104,7 @@ class SymmetricLoss(nn.Module):
             gaps["policy"] = [policy_divergence(g, p, here) for g, p in zip(transforms, there, strict=True)]
         own, *moved = (value for _, _, values in answers for value in values)
         gaps["value"] = [
-            value_consistency_loss(carry(self.symmetry.spaces, g.values, v, tensordict.batch_size, "the value"), own)
-            for g, v in zip(transforms, moved, strict=True)
+            value_consistency_loss(g.values(v, "the value"), own) for g, v in zip(transforms, moved, strict=True)
         ]
         for name, gap in gaps.items():
             mean = torch.stack(gap).mean()
@@ -119,7 +122,8 @@ class SymmetricLoss(nn.Module):
         if self.mixes:
             return data
         if keys.advantage not in data.keys(True):
-            data, params = data.clone(False), self.loss._cached_critic_network_params_detached
+            data, params = data.clone(False), self.loss.critic_network_params
+            params = None if params is None else params.detach()
             self.loss.value_estimator(data, params=params, target_params=self.loss.target_critic_network_params)
         read = [*self.loss.actor_network.in_keys, *self.loss.critic_network.in_keys]
         read += [keys.action, keys.sample_log_prob, keys.advantage, keys.value_target, keys.value]

@@ -186,7 +186,7 @@ def weights_to_start(source: str | os.PathLike[str], learner: Learner) -> tuple[
             raise UserError(
                 f"cannot start from {trained.source}: it is a policy of {config.algorithm} on {config.task} with the "
                 f"network {config.network.name}, and {of_it} but {of_this} in this run; choose {algorithm}the task "
-                "settings and the network of that policy"
+                f"settings and the network of that policy (--network {config.network.name})"
             )
     weights = {name: t.cpu().expand(seeds, *t.shape[1:]).contiguous() for name, t in {**given, **fitting}.items()}
     return InitialPolicy(source=os.fspath(source), sha256=digest(weights, {})), weights

@@ -93,7 +93,8 @@ class Transform:
         if self.action_index is None:
             return self.push_outputs(action)
         flat = action.reshape(self._seeds_of(action), -1)
-        return self.per_agent(self.action_index.gather(1, flat).reshape(action.shape))
+        moved = self.action_index.gather(1, flat).reshape(action.shape)
+        return moved if self.agents is None else self._move(moved, self.agents, agent_axis=-1)
 
     def per_agent(self, x: Tensor) -> Tensor:
         """Let a number per agent [S, ..., N] (reward, advantage) move with it; one per world [S, ..., 1] stays."""

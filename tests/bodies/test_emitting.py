@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 import torch
 
-from esp_cli import Body, layout
+from esp_cli import Body, Field, Kind, layout
 from esp_cli.bodies.auditing import audit
-from esp_cli.bodies.emitting import emitted
+from esp_cli.bodies.emitting import emitted, mirror_of
 from esp_cli.bodies.kinds import grid
 from esp_cli.bodies.numbers import ACTION, Numbers, map_of, numbers_of
 from esp_envs.errors import UserError
-from tests.bodies.models import biped
+from tests.bodies.models import biped, legged
 from tests.bodies.test_fields import anymal
 from tests.cli.running import esp, refused
 from tests.torture.mirrors import ROBOTS, Mirrors
@@ -247,6 +247,39 @@ def test_one_tensor_for_several_groups_is_refused(body):
     pytest.importorskip("tensordict")
     with pytest.raises(UserError, match=r"returns Tensor as observations; return a tensor, or tensors by group"):
         audit(lambda obs, actions: (obs["policy"].repeat(2, 1), actions.repeat(2, 1)), body, groups(body))
+
+
+def test_a_mirror_is_of_the_elements_that_all_numbers_carry():
+    body, action = Body(["a"], {"rot90": {"a": "a"}, "flip-x": {"a": "a"}}), Field("a", Kind.SCALAR)
+    square, oblong = ({"policy": layout(body.scan(grid(size, 1))), ACTION: layout(action)} for size in ((1, 1), (2, 1)))
+    assert body.group == "d4"
+    assert set(mirror_of(body, oblong).ELEMENTS) == {"flip-x", "flip-y", "rot180"}
+    assert len(mirror_of(body, square).ELEMENTS) == 7
+    with pytest.raises(UserError, match="the body has no rot90; its group is d2"):
+        mirror_of(body, oblong, "rot90")
+    for group in ("so2", "o2", "flip-x*a-1-0"):
+        with pytest.raises(UserError, match=r"is no list of turns and mirrors; write some of .*flip-y"):
+            mirror_of(body, oblong, group)
+    along, across = body.scan([[1, 0], [2, 0]], name="along"), body.scan([[0, 1], [0, 2]], name="across")
+    with pytest.raises(UserError, match="the numbers carry no element of d4 together; leave a field of points out"):
+        mirror_of(body, {"policy": layout(along, across), ACTION: layout(action)})
+
+
+def test_the_commands_name_the_elements_that_a_scan_leaves_out(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    Path("spider.xml").write_text(legged([(0.2, 0, 0), (0, 0.2, 90), (-0.2, 0, 180), (0, -0.2, 270)]))
+    Path("my_scan.py").write_text(
+        "from esp_cli import layout\nfrom esp_cli.bodies import grid\ndef numbers(body):\n"
+        "    return {'policy': layout(body.scan(grid((2, 1), 1))), 'action': layout(body.controls())}\n"
+    )
+    order = ["--order", "my_scan:numbers"]
+    written = esp("mirror", "spider.xml", "--emit", "numpy", "-o", "my_spider.py", *order)
+    audited = esp("check", "mirror", "my_spider:compute_symmetric_states", "spider.xml", *order)
+    assert audited.stdout.endswith("is right: its copies are identity, flip-x, flip-y, rot180\n")
+    for result in (written, audited):
+        assert "left out, as not all numbers carry them: rot90, rot270" in result.stderr
+    assert subprocess.run([sys.executable, "-I", "test_my_spider.py"], check=True, capture_output=True).stdout
 
 
 def test_the_command_writes_audits_and_refuses(tmp_path, monkeypatch):

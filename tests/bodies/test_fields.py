@@ -46,7 +46,8 @@ def walker(body: Body, history: int = 1) -> Symmetry:
 
 def moved(field: Field, element: str, row: list[float]) -> list[float]:
     symmetry = Symmetry(observation=layout(field), action=Continuous(layout(Field("a", VECTOR_3D))), group=element)
-    return symmetry.transforms(torch.zeros(1).double())[0].obs(torch.tensor([row], dtype=torch.float64))[0].tolist()
+    obs = torch.tensor([row], dtype=torch.float64)
+    return symmetry.transforms(obs)[0].obs(obs)[0].tolist()
 
 
 @pytest.mark.parametrize(
@@ -203,8 +204,9 @@ def test_joints_that_are_no_list_of_names_are_refused(joints, mirror, words):
 def test_a_scan_of_a_grid_turns_by_quarters_only_where_it_is_square():
     quarter = Body(["a"], {"rot90": {"a": "a"}})
     assert moved(quarter.scan(grid((1, 1), 1)), "rot90", [1, 2, 3, 4]) == [3, 1, 4, 2]
-    with pytest.raises(UserError, match="no point"):
-        quarter.scan(grid((2, 1), 1))
+    assert moved(quarter.scan(grid((2, 1), 1)), "rot180", [1, 2, 3, 4, 5, 6]) == [6, 5, 4, 3, 2, 1]
+    with pytest.raises(UserError, match="the body has no such symmetry for its points; it has rot180"):
+        moved(quarter.scan(grid((2, 1), 1)), "rot90", [1, 2, 3, 4, 5, 6])
 
 
 def test_whole_histories_are_mirrored_and_a_wrong_mirror_shows():

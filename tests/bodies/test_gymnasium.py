@@ -139,7 +139,7 @@ def test_paired_states_tell_the_mirror_from_another_and_from_a_wrong_sign():
         (wrong, "flip-x", True, False),
     ):
         kinds = {"observation": layout, "action": env.action, "state": env.simulated}
-        (g,) = Symmetry(**kinds, group=group, copies="all").transforms(state)
+        (g,) = Symmetry(**kinds, group=group, copies="all").transforms(seen)
         image, paid = reached(env, g.state(state), g.action(action[0, :, 0])[None, :, None])
         assert torch.allclose(image, g.obs(seen), atol=1e-3, rtol=1e-3) == sees
         assert torch.allclose(paid, reward, atol=1e-3) == pays

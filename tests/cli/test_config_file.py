@@ -141,6 +141,7 @@ def test_a_wrong_file_is_one_sentence(tmp_path: Path, content: object, sentence:
         ("mappo.gamma = inf", "sets 'mappo.gamma' to inf; write a finite number"),
         ("task.day = 2020-01-01", "sets 'task.day' to a date or time"),
         (f"[a{'.a' * 3000}]\nx = 1", "is not valid TOML: it is nested more than 64 deep"),
+        ("[mapo]\n[mappo]", "has an empty section 'mapo'; did you mean 'mappo'?"),
         (f"a{'.a' * 3000} = 1", "is not valid TOML: it is nested more than 64 deep"),
     ],
 )

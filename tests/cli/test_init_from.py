@@ -61,7 +61,7 @@ def test_a_policy_that_does_not_fit_is_one_sentence_and_leaves_no_folder(finishe
     assert "is [1, 8] there but [1, 9] in this run; choose the task settings and the network" in wider
     other = refused("train", "--algo", "qmix", "--set", "network.hidden=[9]", "--seeds", 2, *out, finished)
     assert "it is a policy of mappo on navigation with the network mlp, and 'head.epsilon' is missing there" in other
-    assert other.endswith("choose the algorithm, the task settings and the network of that policy")
+    assert other.endswith("choose the algorithm, the task settings and the network of that policy (--network mlp)")
     seeds = refused("train", *TINY_OPTIONS, "--seeds", 3, *out, finished)
     assert "which holds 2; train 2 seeds, or start from a policy of one seed" in seeds
     assert "does not exist" in refused("train", *TINY_OPTIONS, *out, tmp_path / "nothing")

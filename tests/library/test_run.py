@@ -104,7 +104,7 @@ def test_a_listener_stops_a_run_and_training_goes_on_bit_for_bit(run: Run, tmp_p
 def test_a_listener_that_says_nothing_stops_nothing(tmp_path: Path) -> None:
     told: list[int] = []
     assert train(
-        "navigation", steps=200, settings=SMALL, out=tmp_path / "cn", listener=lambda p: told.append(p.step)
+        "navigation", steps=np.int64(200), settings=SMALL, out=tmp_path / "cn", listener=lambda p: told.append(p.step)
     ).is_complete
     assert told == [0, 100, 200]
 
@@ -142,6 +142,12 @@ def test_what_cannot_be_played_or_drawn_is_refused(run: Run, tmp_path: Path, ask
     [
         ({"settings": {"mappo.lr": 1}}, "unknown setting 'mappo.lr'"),
         ({"seeds": 3}, r"not how many; write seeds=range\(3\)"),
+        ({"seeds": np.int64(3)}, r"not how many; write seeds=range\(3\)"),
+        ({"seeds": "01"}, r"seeds are whole numbers, not '01'; write for example seeds=range\(10\)"),
+        ({"seeds": ["0"]}, r"seeds are whole numbers, not \['0'\]"),
+        ({"seeds": None}, "seeds are whole numbers, not None"),
+        ({"settings": {1: 2}}, r"settings are \{1: 2\}; give values by dotted name"),
+        ({"settings": [("a", 1)]}, r"settings are \[\('a', 1\)\]; give values by dotted name"),
         ({"steps": "1k"}, "steps are a whole number, not '1k'"),
         ({"seeds": (-1,)}, "bad value -1 for 'run.seeds.0': input should be greater than or equal to 0"),
         ({"device": "cuda:1"}, "there is no device 'cuda:1'; choose cpu, cuda or auto"),

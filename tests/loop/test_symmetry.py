@@ -153,6 +153,27 @@ def test_agents_that_change_places_take_their_numbers_along() -> None:
     assert torch.equal(moved[2, 1, :2], obs[0, 0, :2])
 
 
+def test_elements_of_a_replay_take_the_shapes_of_copies_and_no_others() -> None:
+    """As many rows as agents, so that nothing but the leading axes tells a number of a row from that of an agent."""
+    symmetry = Symmetry(observation=OTHERS, action=MOVES, group="rot90*agents-1-2-0", num_agents=3)
+    (g,) = symmetry.transforms(random(3, 3, 6))
+    numbers, action, team = (
+        torch.tensor([[10.0, 11, 12]] * 3),
+        torch.tensor([[0, 1, 2]] * 3),
+        torch.arange(3.0)[:, None],
+    )
+    for column in (numbers, numbers.unsqueeze(-1)):
+        assert g.per_agent(column).flatten(1).tolist() == [[12, 10, 11]] * 3
+        assert g.values(column).flatten(1).tolist() == [[11, 12, 10]] * 3
+    assert g.per_agent(team).tolist() == g.values(team).tolist() == team.tolist()
+    for given in (action, action.unsqueeze(-1), action.to(torch.uint16)):
+        assert g.action(given).flatten(1).tolist() == [[3, 1, 2]] * 3
+    assert g.action(nn.functional.one_hot(action, 4)).argmax(-1).tolist() == [[3, 1, 2]] * 3
+    for move, wrong in ((g.action, action[:2]), (g.per_agent, random(3, 3, 5)), (g.values, numbers[:2])):
+        with pytest.raises(ValueError, match=r"but \[3, 3\]"):
+            move(wrong)
+
+
 def test_actions_may_come_as_a_column_or_one_hot() -> None:
     symmetry, obs, action = quarter(), random(4, 3), torch.arange(4)
     plain = symmetry.augment(obs, action)[1]
@@ -393,8 +414,12 @@ def test_a_check_says_which_shape_is_needed_and_takes_other_precisions() -> None
         symmetry.check(team)
     with pytest.raises(ValueError, match=r"nothing to check in Tensor; give a task, or Transitions\(obs, "):
         symmetry.check(data.obs)
-    with pytest.raises(ValueError, match="'obs' of the transitions has shape"):
-        symmetry.check(Transitions(*(part[:, 0] for part in (data.obs, data.action, data.reward, data.next_obs))))
+    parts = (data.obs, data.action, data.reward, data.next_obs)
+    for one, given in ((quarter(), [part[:, 0, 0] for part in parts]), (symmetry, [part[:, 0] for part in parts])):
+        with pytest.raises(ValueError, match=r"'obs' of the transitions has shape .*; give \[episodes, steps, agents"):
+            one.check(Transitions(*given))
+        with pytest.raises(ValueError, match="obs is of type ndarray; give a tensor"):
+            one.check(Transitions(*(part.numpy() for part in given)))  # type: ignore[arg-type]
 
 
 IMPORTED = """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import pytest
@@ -17,7 +18,7 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from tensordict.nn.distributions import NormalParamExtractor
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.modules import ProbabilisticActor, QMixer, QValueModule, TanhNormal
-from torchrl.objectives import ClipPPOLoss, DQNLoss, ValueEstimators
+from torchrl.objectives import A2CLoss, ClipPPOLoss, DQNLoss, KLPENPPOLoss, ReinforceLoss, ValueEstimators
 from torchrl.objectives.multiagent import QMixerLoss
 
 from esp_cli.loop.torchrl import SymmetricCopies, SymmetricLoss
@@ -275,5 +276,32 @@ def test_qmix_compares_the_mixed_value_of_actions_taken() -> None:
 def test_a_loss_of_another_kind_is_refused() -> None:
     net = TensorDictModule(nn.Linear(WIDTH, 4), ["observation"], ["action_value"])
     module = TensorDictSequential(net, QValueModule("categorical", spec=None))
-    with pytest.raises(ValueError, match="DQNLoss is not known; give a loss of PPO's family, or QMixerLoss"):
+    with pytest.raises(ValueError, match="DQNLoss is not known; give ClipPPOLoss, MAPPOLoss, IPPOLoss, A2CLoss or QM"):
         SymmetricLoss(DQNLoss(module, action_space="categorical"), symmetry())
+    for kind in (KLPENPPOLoss, ReinforceLoss):  # which have an actor and a critic too
+        with pytest.raises(ValueError, match=f"{kind.__name__} is not known"):
+            SymmetricLoss(kind(actor(), critic()), symmetry())
+    with pytest.raises(ValueError, match="a sum over rows, but consistency is a mean; give it reduction='mean'"):
+        SymmetricLoss(ClipPPOLoss(actor(), critic(), reduction="sum"), symmetry())
+
+
+@pytest.mark.parametrize("shape", [[], [0]])
+def test_data_without_rows_are_refused(shape: list[int]) -> None:
+    with pytest.raises(ValueError, match=re.escape(f"the data have batch_size {shape}; give [B, ...] of one row")):
+        SymmetricLoss(ppo(ClipPPOLoss), symmetry())(TensorDict({}, shape))
+
+
+def test_a2c_estimates_advantages_that_are_missing() -> None:
+    loss = A2CLoss(actor(), critic())
+    keys = {name: ("agents", name) for name in ("action", "reward", "done", "terminated")}
+    loss.set_keys(**keys, value=("agents", "state_value"), sample_log_prob=("agents", "log_prob"))
+    data = rows().exclude(("agents", "advantage"), ("agents", "value_target"))
+    for name in ("done", "terminated"):
+        data["next", "agents", name] = torch.zeros(ROWS, AGENTS, 1, dtype=torch.bool)
+    got = SymmetricLoss(loss, symmetry(), 0.5)(data.clone())
+    alone = SymmetricLoss(loss, symmetry(), 0.5, augment=False)(data.clone())
+    plain = loss(data.clone())
+    assert got["value_symmetry"].item() > 1e-3
+    assert alone["loss_critic"].item() == pytest.approx(
+        plain["loss_critic"].item() + 0.5 * got["value_symmetry"].item(), rel=1e-4
+    )

@@ -136,6 +136,8 @@ def test_values(make_spec) -> None:
     assert moving.values(v).tolist() == [[[11, 12, 10]]]
     assert moving.values(v[..., :1]).tolist() == [[[10]]]
     assert build_transform([rotation(90)], make_spec()).values(v) is v
+    with pytest.raises(ValueError, match=r"axis -1 of \[1, 3, 1\] must hold 3 agents"):
+        moving.action(torch.zeros(1, 3, 1, dtype=torch.int64))
 
 
 def test_one_element_serves_any_number_of_seeds(make_spec) -> None:
