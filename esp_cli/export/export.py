@@ -37,7 +37,8 @@ class Job:
     sample: Sample  # of what it does
     description: dict[str, Any]  # what `policy.json` holds
     words: dict[str, Any]  # what templates say of it
-    scenes: epuck.Scenes | None  # states of the task; None unless the policy can drive an e-puck
+    seen: float | None  # of poses, see `Export`; None unless the policy can drive an e-puck
+    note: str | None  # why it cannot, where its task can
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class Export:
     files: tuple[str, ...]
     size: int  # of the files together, bytes
     agreement: Agreement | None  # with the policy; None where it could not be run here
-    note: str | None = None  # why it could not
+    note: str | None = None  # why it could not, or why no e-puck can be driven
     seen: float | None = None  # largest difference between an observation built from poses, if any, and the task's
 
 
@@ -77,7 +78,7 @@ def _c(job: Job) -> Files:
 
 def _numpy(job: Job) -> Files:
     source = numpy_source(job.program, _summary(job), job.description)
-    beside = {} if job.scenes is None else {"esp_epuck.py": (RUNTIME / "esp_epuck.py").read_bytes()}
+    beside = {} if job.seen is None else {"esp_epuck.py": (RUNTIME / "esp_epuck.py").read_bytes()}
     return {"policy.py": source} | beside
 
 
@@ -130,8 +131,8 @@ def _made(trained: TrainedPolicy, formats: Sequence[str]) -> tuple[Exported, Fil
     sample = take_sample(trained, program)
     description = describe(trained, program, sample)
     drives = "robot" in description and "numpy" in formats and not program.memory_width
-    scenes = epuck.take_scenes(trained) if drives else None
-    job = Job(trained, program, sample, description, words(trained, program, description), scenes)
+    seen, note = epuck.seen_from_poses(trained, description) if drives else (None, None)
+    job = Job(trained, program, sample, description, words(trained, program, description), seen, note)
     files = {name: FORMATS[name].write(job) for name in formats}
     results = tuple(_checked(name, own, job) for name, own in files.items())
     written = {name: content for own in files.values() for name, content in own.items()}
@@ -183,10 +184,8 @@ def _checked(name: str, files: Files, job: Job) -> Export:
         agreement = compare(job.sample, form.run(folder, job.program))
         if name == "c" and not c_file.example_runs(folder):
             raise RuntimeError("the worked example of the exported C gives another action; this is a bug")
-        seen = None
-        if job.scenes is not None and name == "numpy":
-            seen = epuck.compare_scenes(job.scenes, job.description)
-    return Export(name, tuple(files), size, agreement, seen=seen)
+    note, seen = (job.note, job.seen) if name == "numpy" else (None, None)
+    return Export(name, tuple(files), size, agreement, note, seen)
 
 
 def _readme(job: Job, results: Sequence[Export]) -> bytes:
@@ -197,6 +196,6 @@ def _readme(job: Job, results: Sequence[Export]) -> bytes:
         example=[(k, shortly(v)) for k, v in example.items() if not k.startswith(("memory", "sets"))],
         results=results,
         states=epuck.STATES,
-        robot=None if job.scenes is None else job.description["robot"],
+        robot=None if job.seen is None else job.description["robot"],
     )
     return c_file.of_role(readme, job.trained.role)
