@@ -20,6 +20,7 @@ from esp_cli.export.onnx_file import onnx_model, onnx_runner
 from esp_cli.export.program import Program, program_of
 from esp_cli.export.templates import RUNTIME, filled
 from esp_cli.export.torch_file import torch_archive, torch_runner
+from esp_cli.files.formatting import escaped
 from esp_cli.files.writing import replace_file
 from esp_cli.policies.loading import TrainedPolicy
 from esp_envs.errors import UserError
@@ -84,7 +85,7 @@ def _numpy(job: Job) -> Files:
 
 def _summary(job: Job) -> str:
     """Return title, layouts and memory as plain lines, for the top of a source file."""
-    return filled("summary.txt", **job.words).decode().rstrip()
+    return escaped(filled("summary.txt", **job.words).decode().rstrip())
 
 
 FORMATS = {
@@ -128,6 +129,9 @@ def _made(trained: TrainedPolicy, formats: Sequence[str]) -> tuple[Exported, Fil
     """Make the files of an export and check each format; nothing is written yet."""
     formats = tuple(dict.fromkeys(formats))
     program = program_of(trained.policy)
+    if not program.num_inputs and (empty := {"c", "torch"}.intersection(formats)):
+        formats = " and ".join(sorted(empty))
+        raise UserError(f"{trained.source} sees no number, which {formats} cannot hold; choose onnx or numpy")
     sample = take_sample(trained, program)
     description = describe(trained, program, sample)
     drives = "robot" in description and "numpy" in formats and not program.memory_width
@@ -147,6 +151,9 @@ def refuse_taken(folders: Iterable[Path], formats: Sequence[str], force: bool) -
     for folder in folders:
         if folder.exists() and not folder.is_dir():
             raise UserError(f"{folder} is a file; name a folder for the export with --out")
+        blocked = next((folder / name for name in names if (folder / name).is_dir()), None)
+        if blocked is not None:
+            raise UserError(f"{blocked} is a folder in the place of a file; move it away, or choose another --out")
         taken = [name for name in dict.fromkeys(names) if (folder / name).exists()]
         if taken and not force:
             raise UserError(
@@ -157,10 +164,11 @@ def refuse_taken(folders: Iterable[Path], formats: Sequence[str], force: bool) -
 def _put(files: Files, folder: Path) -> None:
     """Put files into a folder, each as a whole, in the place of all files of an export that is there."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name in _exported(folder) - files.keys():
-        (folder / name).unlink(missing_ok=True)
+    gone = _exported(folder) - files.keys()
     for name, content in files.items():
         replace_file(folder / name, content)
+    for name in gone:
+        (folder / name).unlink(missing_ok=True)
 
 
 def _exported(folder: Path) -> set[str]:
