@@ -138,7 +138,9 @@ def _write_page(material: Material, out: Path | None, films: bool, style: Litera
 
     if films:
         with console.TrainingProgress(len(material.runs), description="draw", unit="films") as progress:
-            draw_films(material.runs, progress.update)
+            unseen = draw_films(material.runs, progress.update)
+        for run in unseen:
+            console.note(f"{run} has no film: its task does not draw itself")
     if out is not None and material.curves:
         for file in write_report(material, out, style):
             console.note(f"report -> {file}")
