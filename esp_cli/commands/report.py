@@ -84,6 +84,8 @@ def report(
     else:
         if films and out is None:
             raise UserError("--films draws for the page that --out writes; add --out FOLDER, or leave it out")
+        if style == "paper" and out is None and plot is None:
+            raise UserError("--style is of the figures that --out or --plot writes; add one of them, or leave it out")
         material = _side_by_side(runs, options.command_line(context), at or [], limits, mode)
 
     _write_page(material, out, films, style)

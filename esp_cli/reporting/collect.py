@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from esp_cli.defaults import Mode
 from esp_cli.files.documents import flat
-from esp_cli.files.formatting import format_exactly
+from esp_cli.files.formatting import format_exactly, name_of
 from esp_cli.policies.evaluation import FinalEvaluation
 from esp_cli.policies.statistics import Passing, area_under_curve, steps_to_threshold
 from esp_cli.reporting.results import CellResult, Results, returns_of, summarised
@@ -69,9 +69,8 @@ class RunCurve:
 def read_curve(path: Path, label: str | None, mode: Mode) -> RunCurve:
     """Read the evaluations of a run folder, which has to have one."""
     folder = RunFolder.open(path)
-    name = path.resolve().name if path.name in ("", "..") else path.name  # a link keeps its own name
     rows = read_metrics(folder.metrics_path)
-    curve = _curve(rows, mode, path, label or name, parse_config(folder.config, path))
+    curve = _curve(rows, mode, path, label or name_of(path), parse_config(folder.config, path))
     return replace(curve, task_version=folder.task_version())
 
 
