@@ -55,6 +55,7 @@ def evaluate(
     changed = options.parse_task_settings(settings or [], physics)
     trained = open_policy(policy, algo, prior).transfer(changed)
     options.note_idle_settings(trained.config.task, changed, trained.config.task_settings)
+    options.refuse_unused([trained.config], task, [algo], network)
     for text in trained.notes:
         console.note(text)
     usual = max(1, min(EPISODES, _AGENT_STEPS // (trained.spec.horizon * trained.spec.num_agents)))

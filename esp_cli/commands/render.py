@@ -91,6 +91,7 @@ def render(
     names = [*map(name_of, named)]
     names = names if len({*names}) == len(names) else [*map(str, named)]
     opened = [open_policy(where, algo, prior).transfer(changed) for where in named]
+    options.refuse_unused([one.config for one in opened], task, [algo], network)
     options.note_idle_settings(opened[0].config.task, changed, opened[0].config.task_settings)
     for text in dict.fromkeys(text for trained in opened for text in trained.notes):
         console.note(text)

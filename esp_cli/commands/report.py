@@ -88,6 +88,7 @@ def report(
             raise UserError("--style is of the figures that --out or --plot writes; add one of them, or leave it out")
         material = _side_by_side(runs, options.command_line(context), at or [], limits, mode)
 
+    options.refuse_unused([cell.config for cell in material.study.cells], task, algo, network)
     _write_page(material, out, films, style)
     if results is not None:
         console.write_json(results, material.results.document())

@@ -298,7 +298,9 @@ def test_training_takes_what_it_discovers_and_a_run_is_looked_at_with_its_settin
         == "discovered:flip-x*agents*landmarks-3"
     )
     assert "found flip-x*agents*landmarks-3" in esp("discover", folder).stdout
-    assert "is a run of navigation, and --task says wildlife" in refused("discover", folder, "--task", "wildlife")
+    assert "--task wildlife changes nothing here, where the task is navigation" in refused(
+        "discover", folder, "--task", "wildlife"
+    )
     esp("train", "--resume", folder)
 
 
