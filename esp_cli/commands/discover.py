@@ -71,6 +71,8 @@ def _discovery(
     path = Path(what)
     register_named([task, None if path.exists() else what])
     if path.suffix == ".npz" or path.is_file():
+        if not path.exists():
+            raise UserError(f"there is no file {what}; name one, a run folder, or a task")
         if task is None:
             raise UserError(f"{what} does not say what its numbers are; add --task")
         if logs:
