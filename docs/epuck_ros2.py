@@ -13,7 +13,7 @@ Parameters
     pillars (list of x, y of each, m): by default none.
 
 Robots stand still until the first poses come, when no new ones came for half a second, and when a number is not
-finite. Poses with the time stamp of those before are not new.
+finite. Poses are as old as their time stamp says, where they have one; of the stamp of those before they are not new.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Driver(Node):  # type: ignore[misc] # a class of ROS 2, which has no types
             return
         self.stamp = stamp
         self.poses = [pose_of(pose) for pose in message.poses]
-        self.seen_at_s = self._now_s()
+        self.seen_at_s = min(self._now_s(), stamp[0] + stamp[1] / 1e9) if any(stamp) else self._now_s()
         if not self.goals and all(map(math.isfinite, chain.from_iterable(self.poses))):
             self.goals = [(-x, -y) for x, y, _ in self.poses]
         for k in range(len(self.outputs), len(self.poses)):

@@ -33,11 +33,11 @@ _LOOKS: dict[str, Any] = {
     "rich_markup_mode": "rich",
 }
 _OTHER_NAMES = {
-    "--seed": "--seeds 3 takes the seeds 0 to 2, --seed-list 7 that seed",
-    "--num-envs": "write --set mappo.num_envs=64",
-    "--wandb": "write --track wandb; it stays offline unless WANDB_MODE=online",
+    "--seed": ("--seed-list", "--seeds 3 takes the seeds 0 to 2, --seed-list 7 that seed"),
+    "--num-envs": ("--preset", "write --set mappo.num_envs=64"),
+    "--wandb": ("--track", "write --track wandb; it stays offline unless WANDB_MODE=online"),
 }
-"""Options of other programs -> what is written here."""
+"""Options of other programs -> an option of commands that have something like it, and what is written there."""
 EXIT_MACHINE, EXIT_USER, EXIT_INTERRUPTED = 1, 2, 130
 
 
@@ -113,8 +113,9 @@ def report(failure: Exception | SystemExit) -> int | None:
     if isinstance(failure, typer.TyperException):
         message, context = formatting.own_words(failure.format_message()), getattr(failure, "ctx", None)
         if message:  # empty where no argument was given at all: typer has shown the help already
-            hint = _OTHER_NAMES.get(getattr(failure, "option_name", ""))
-            message = f"{message.split(' (')[0]}; {hint}" if hint else message
+            known = {name for option in context.command.params for name in option.opts} if context else {}
+            needed, hint = _OTHER_NAMES.get(getattr(failure, "option_name", ""), ("", ""))
+            message = f"{message.split(' (')[0]}; {hint}" if needed in known else message
             console.error(f"{message.rstrip('.')} (see '{context.command_path if context else 'esp'} --help')")
         return failure.exit_code
     if isinstance(failure, typer.Abort):

@@ -34,7 +34,9 @@ def ablate(
     choices: StudyChoices,
     methods: Annotated[
         list[str] | None,
-        Option("--methods", help="What is compared, by the names in the table: 'plain,ESP,auto'; by default all."),
+        Option(
+            "--methods", help="What is compared: of breaking 'plain,ESP,auto', of prior 'none,esp'; by default all."
+        ),
     ] = None,
     broken_by: Annotated[
         list[str] | None,

@@ -17,6 +17,7 @@ from esp_envs.errors import UserError
 
 if TYPE_CHECKING:
     from esp_cli.checking import ElementVerdict, PolicyVerdict, SymmetryReport
+    from esp_cli.policies.loading import TrainedPolicy
     from esp_envs.conformance import Finding
     from esp_envs.promises import MakeWorlds
     from esp_envs.spec import TaskSpec
@@ -98,7 +99,7 @@ def check(
             raise UserError(f"{task} has roles, of whose policies nothing is measured here; leave --policy out")
         code = _check_roles(spec, make_worlds, transforms, seconds, json)
     else:
-        code = _check_symmetry(make_worlds, transforms, policy, seconds, json)
+        code = _check_symmetry(make_worlds, transforms, _opened(policy, algo, network), seconds, json)
     if code:
         raise typer.Exit(code)
 
@@ -175,17 +176,21 @@ def _check_roles(
     return 1 if any(r.broken for r in reports.values()) else 2 * any(r.uncovered for r in reports.values())
 
 
+def _opened(where: Path | None, algo: list[str] | None, network: list[str] | None) -> TrainedPolicy | None:
+    from esp_cli.policies.loading import open_policy
+
+    policy = None if where is None else open_policy(where)
+    options.refuse_unused([] if policy is None else [policy.config], None, algo, network)
+    return policy
+
+
 def _check_symmetry(
-    make_worlds: MakeWorlds, transforms: str | None, policy: Path | None, seconds: float, json: str | None
+    make_worlds: MakeWorlds, transforms: str | None, policy: TrainedPolicy | None, seconds: float, json: str | None
 ) -> int:
     from esp_cli.checking import check_policy, check_symmetry
     from esp_cli.checking.candidates import NothingToTry
 
-    measured: list[PolicyVerdict] = []
-    if policy is not None:
-        from esp_cli.policies.loading import open_policy
-
-        measured = check_policy(open_policy(policy), make_worlds, transforms)
+    measured = [] if policy is None else check_policy(policy, make_worlds, transforms)
     try:
         with console.watching("check", "elements") as watch:
             report = check_symmetry(make_worlds, transforms, watch=watch, seconds=seconds)

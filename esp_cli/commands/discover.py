@@ -16,6 +16,7 @@ from esp_cli.commands.options import (
     TaskSetOption,
     note_idle_settings,
     parse_task_settings,
+    refuse_unused,
     register_named,
 )
 from esp_envs.errors import UserError
@@ -70,6 +71,8 @@ def _discovery(
     path = Path(what)
     register_named([task, None if path.exists() else what])
     if path.suffix == ".npz" or path.is_file():
+        if not path.exists():
+            raise UserError(f"there is no file {what}; name one, a run folder, or a task")
         if task is None:
             raise UserError(f"{what} does not say what its numbers are; add --task")
         if logs:
@@ -87,8 +90,7 @@ def _discovery(
 
         config = parse_config(RunFolder.open(path).config, path)
         name, whole = config.task, config.task_settings | settings
-        if task not in (None, name):
-            raise UserError(f"{what} is a run of {name}, and --task says {task}; leave --task out")
+        refuse_unused([config], [task])
     whole = resolve_task_settings(name, whole)
     note_idle_settings(name, settings, whole)
     worlds = partial(make, name, settings=whole)

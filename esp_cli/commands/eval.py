@@ -55,6 +55,7 @@ def evaluate(
     changed = options.parse_task_settings(settings or [], physics)
     trained = open_policy(policy, algo, prior).transfer(changed)
     options.note_idle_settings(trained.config.task, changed, trained.config.task_settings)
+    options.refuse_unused([trained.config], task, [algo], network)
     for text in trained.notes:
         console.note(text)
     usual = max(1, min(EPISODES, _AGENT_STEPS // (trained.spec.horizon * trained.spec.num_agents)))
@@ -68,10 +69,12 @@ def evaluate(
 def _print(result: FinalEvaluation, policy: str) -> None:
     from esp_cli.policies.statistics import normalised
 
+    has_scale = normalised(0.0, result.scale) is not None
+
     def row(label: str, mean: float | None, error: SeedSummary | EpisodeSpread) -> tuple[str, ...]:
-        scaled = None if mean is None else normalised(mean, result.anchors)
+        scaled = None if mean is None else normalised(mean, result.scale)
         score = "-" if scaled is None else f"{scaled:.2f}"
-        return label, console.format_mean(mean, error.sem), console.format_interval(error.ci95), score
+        return label, console.format_mean(mean, error.sem), console.format_interval(error.ci95), *[score] * has_scale
 
     names = {"random": "random", "heuristic": f"heuristic {''.join(result.heuristics[:1])}"}
     names = {key: names.get(key, f"heuristic {key}") for key in result.anchors}
@@ -92,9 +95,10 @@ def _print(result: FinalEvaluation, policy: str) -> None:
     caption = f"convention {result.convention}; mean ± s.e.m. and 95 % interval {over}"
     if 1 < len(result.seeds) < 5:
         caption += "; so few seeds make it too narrow"
-    if result.heuristics:
+    if has_scale:
         caption += "; normalised: 0 random, 1 the best heuristic"
-    console.table(("policy", "episode return>", "95 % interval>", "normalised>"), rows, title=title, caption=caption)
+    headings = ("policy", "episode return>", "95 % interval>", *["normalised>"] * has_scale)
+    console.table(headings, rows, title=title, caption=caption)
     metrics = [
         (metric, f"{value:.4f}", *(f"{result.anchor_metrics[key].get(metric, math.nan):.4f}" for key in names))
         for metric, value in result.metrics.items()

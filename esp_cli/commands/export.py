@@ -57,6 +57,7 @@ def export(
 
     options.register_named(task, [algo], network)
     trained = open_policy(policy, algo, prior)
+    options.refuse_unused([trained.config], task, [algo], network)
     for text in trained.notes:
         console.note(text)
     parts = {role.name: trained.of_role(role.name) for role in trained.spec.roles} or {"": trained}

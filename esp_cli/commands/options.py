@@ -21,7 +21,15 @@ from esp_cli.commands.counts import parse_count, parse_seed_list, parse_seeds
 from esp_cli.defaults import PriorKind
 from esp_envs.errors import UserError
 
+if TYPE_CHECKING:
+    from esp_cli.training.config import RunConfig
+
+    Seeds = tuple[int, ...]
+else:  # typer trusts the parser for a plain `tuple`, but would read tuple[int, ...] as a pattern of its own
+    Seeds = tuple
+
 T = TypeVar("T")
+Names = Iterable[Any] | None  # given to an option that may be repeated
 
 
 def parse_assignments(items: Iterable[str]) -> dict[str, object]:
@@ -98,9 +106,7 @@ def installed_tasks() -> list[str]:
     return [entry.name for entry in entries("esp.tasks")]
 
 
-def register_named(
-    tasks: Iterable[object] | None, algorithms: Iterable[object] | None = None, networks: Iterable[object] | None = None
-) -> None:
+def register_named(tasks: Names, algorithms: Names = (), networks: Names = ()) -> None:
     """Admit what this command line names as module:Class; a name of any other form needs nothing."""
     from esp_envs.installed import load
 
@@ -113,6 +119,17 @@ def register_named(
         for name in names or ():
             if isinstance(name, str) and ":" in name:
                 load(home).register(name)
+
+
+def refuse_unused(configs: Iterable[RunConfig], tasks: Names, algorithms: Names = (), networks: Names = ()) -> None:
+    """Refuse a class of the caller, or the task of a run, that nothing which the command works on is made with."""
+    made = [{"task": one.task, "algo": one.algorithm, "network": one.network.name} for one in configs]
+    for option, names in (("task", tasks), ("algo", algorithms), ("network", networks)):
+        used = dict.fromkeys(one[option] for one in made)
+        for name in names or ():
+            if name and name not in used and (":" in name or option == "task"):
+                where = f", where the {option} is {', '.join(used)}" if used else ""
+                raise UserError(f"--{option} {name} changes nothing here{where}; leave it out")
 
 
 def _option_parser(parse: Callable[[str], T], name: str) -> Callable[[str], T]:
@@ -176,11 +193,7 @@ OwnNetworkOption = Annotated[
     list[str] | None, Option("--network", help="Import your network, which the run uses.", **_OWN)
 ]
 PresetOption = Annotated[
-    str,
-    Option(
-        "--preset",
-        help="'default' (measured best), 'fast' (fewer seconds) or 'paper' (the paper's settings).",
-    ),
+    str, Option("--preset", help="'default' (measured best), 'fast' (fewer seconds) or 'paper' (the paper's settings).")
 ]
 StepsOption = Annotated[
     int,
@@ -192,10 +205,6 @@ StepsOption = Annotated[
         parser=_option_parser(parse_count, "STEPS"),
     ),
 ]
-if TYPE_CHECKING:
-    Seeds = tuple[int, ...]
-else:  # typer trusts the parser for a plain `tuple`, but would read tuple[int, ...] as a pattern of its own
-    Seeds = tuple
 
 
 def seeds_option(default: int) -> Any:

@@ -12,6 +12,7 @@ from typer import Argument, Option
 from esp_cli import console
 from esp_cli.commands import options
 from esp_cli.defaults import SLOWEST
+from esp_cli.files.formatting import name_of
 
 _EPISODES = 64  # of the reference policies, at most
 EPILOG = """Examples:\n
@@ -87,18 +88,21 @@ def render(
     options.register_named(task, [algo], network)
     changed = options.parse_task_settings(settings or [], physics)
     named = [policy] if beside is None else [policy, beside]
+    names = [*map(name_of, named)]
+    names = names if len({*names}) == len(names) else [*map(str, named)]
     opened = [open_policy(where, algo, prior).transfer(changed) for where in named]
+    options.refuse_unused([one.config for one in opened], task, [algo], network)
     options.note_idle_settings(opened[0].config.task, changed, opened[0].config.task_settings)
     for text in dict.fromkeys(text for trained in opened for text in trained.notes):
         console.note(text)
     with console.watching("draw", "frames") as watch:
-        drawing = draw(request, opened, [where.name for where in named], watch)
+        drawing = draw(request, opened, names, watch)
     film = f"{drawing.frames} frames -> {out} ({out.stat().st_size / 1024:.0f} kB)"
     picture = f"episode of {drawing.steps} steps -> {out}"
     for text in filter(None, (drawing.note, picture if request.is_picture else film)):
         console.note(text)
     anchors = rough_anchors(opened[0].config, _EPISODES)
-    for where, value in zip(named, drawing.returns, strict=True):
+    for name, value in zip(names, drawing.returns, strict=True):
         scaled = normalised(value, anchors)
         score = "" if scaled is None else f", normalised {scaled:.2f} (0 random, 1 the best heuristic)"
-        console.note(f"{where.name}: return {value:.1f}{score}")
+        console.note(f"{name}: return {value:.1f}{score}")

@@ -84,8 +84,11 @@ def report(
     else:
         if films and out is None:
             raise UserError("--films draws for the page that --out writes; add --out FOLDER, or leave it out")
+        if style == "paper" and out is None and plot is None:
+            raise UserError("--style is of the figures that --out or --plot writes; add one of them, or leave it out")
         material = _side_by_side(runs, options.command_line(context), at or [], limits, mode)
 
+    options.refuse_unused([cell.config for cell in material.study.cells], task, algo, network)
     _write_page(material, out, films, style)
     if results is not None:
         console.write_json(results, material.results.document())
@@ -138,7 +141,9 @@ def _write_page(material: Material, out: Path | None, films: bool, style: Litera
 
     if films:
         with console.TrainingProgress(len(material.runs), description="draw", unit="films") as progress:
-            draw_films(material.runs, progress.update)
+            unseen = draw_films(material.runs, progress.update)
+        for run in unseen:
+            console.note(f"{run} has no film: its task does not draw itself")
     if out is not None and material.curves:
         for file in write_report(material, out, style):
             console.note(f"report -> {file}")

@@ -27,7 +27,8 @@ def settings(
     of: Annotated[
         str | None,
         Argument(
-            help="Algorithm, task or network (also module:Class), 'prior' or 'evaluation'; by default all.",
+            help="Algorithm, task or network (also module:Class), 'prior' or 'evaluation'; by default all but tasks "
+            "of robots, from ant to quadruped, and of other packages.",
             metavar="[ALGO|TASK|NETWORK]",
         ),
     ] = None,
@@ -47,9 +48,10 @@ def _sections(of: str | None) -> Sequence[Section]:
     found = [section for section in built_in if of in (None, section.name)]
     if found or of is None:
         return found
-    if of in installed_tasks():
+    installed = installed_tasks()
+    if of in installed:
         return [section_of("task", of)]
-    names = [section.name for section in built_in]
+    names = [*(section.name for section in built_in), *installed]
     hint = did_you_mean(of, names) or f"; there is {', '.join(names)}"
     raise UserError(f"nothing with settings is called '{of}'{hint}")
 

@@ -28,6 +28,7 @@ View = Literal["auto", "top", "3d"]
 
 FILMS, PICTURES = (".gif", ".mp4"), (".png", ".pdf", ".svg")
 _MM_PER_INCH = 25.4
+_PIXELS = 480  # unless another size is asked for
 FRAMES_PER_SECOND = 25  # most frames per second of a film, unless more are asked for
 _SAMPLED_FRAMES = 8  # frames that the palette of a GIF is made for
 
@@ -40,7 +41,7 @@ class Request:
     seed: int | None = None  # whose policy acts; by default the first
     episodes: int | None = None  # of a film; by default as many as last about 8 s
     view: View = "auto"  # see `open_painter`
-    size: int = 480  # of the longer side of a scene, pixels; caption, axes and legend come on top
+    size: int = _PIXELS  # of the longer side of a scene, pixels; caption, axes and legend come on top
     speed: float = 1.0  # times real time, 0.01 or more
     fps: float | None = None  # most frames per second; by default 25
     width: float | None = None  # of a picture for print, mm; by default as large as `size` says
@@ -55,8 +56,11 @@ class Request:
             raise UserError(f"{self.out} holds one episode; leave out --episodes {self.episodes} or name a .gif file")
         if self.width is not None and not self.is_picture:
             raise UserError(f"{self.out} is a film, whose width --size sets in pixels; leave out --width")
-        if self.is_picture and self.fps is not None:
-            raise UserError(f"{self.out} is a picture without frames; leave out --fps or name a .gif or .mp4 file")
+        if self.is_picture and (self.fps is not None or self.speed != 1):
+            option = "--speed" if self.fps is None else "--fps"
+            raise UserError(f"{self.out} is a picture without frames; leave out {option} or name a .gif or .mp4 file")
+        if self.for_print and self.size != _PIXELS:
+            raise UserError(f"{self.out} is for print, whose width --width sets in mm; leave out --size")
         if self.width is not None and not 20 <= self.width <= 1000:
             raise UserError(f"width is {self.width:g}; give 20 to 1000 mm, as 89 for a column")
         if not SLOWEST <= self.speed < math.inf:  # false for what is no number

@@ -41,10 +41,12 @@ def record(policies: Sequence[TrainedPolicy], episodes: int | None = None, greed
     """Play the same episodes with each policy, of one task and one seed each, by default about `FILM_SECONDS` long."""
     seeds, recorded = policies[0].config.seeds, list[list[Episode]]()
     for trained in policies:
-        env = build_environment(trained.config.model_copy(update={"seeds": seeds}), 1, "film")
+        config = trained.config.model_copy(update={"seeds": seeds})
         controller = PolicyController(trained.policy, None if greedy else generators(seeds, "film", "noise"))
         own, seconds = list[Episode](), 0.0
         while len(own) < episodes if episodes else seconds * (1 + 0.5 / max(1, len(own))) <= FILM_SECONDS:
+            # worlds of its own for each: where one begins hangs on no draw of the one before
+            env = build_environment(config, 1, "film", *([len(own)] if own else []))
             own.append(_play(controller, env))
             seconds += own[-1].steps * env.spec.control_period_s + HOLD_SECONDS
         recorded.append(own)

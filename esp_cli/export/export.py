@@ -20,6 +20,7 @@ from esp_cli.export.onnx_file import onnx_model, onnx_runner
 from esp_cli.export.program import Program, program_of
 from esp_cli.export.templates import RUNTIME, filled
 from esp_cli.export.torch_file import torch_archive, torch_runner
+from esp_cli.files.formatting import escaped
 from esp_cli.files.writing import replace_file
 from esp_cli.policies.loading import TrainedPolicy
 from esp_envs.errors import UserError
@@ -37,7 +38,8 @@ class Job:
     sample: Sample  # of what it does
     description: dict[str, Any]  # what `policy.json` holds
     words: dict[str, Any]  # what templates say of it
-    scenes: epuck.Scenes | None  # states of the task; None unless the policy can drive an e-puck
+    seen: float | None  # of poses, see `Export`; None unless the policy can drive an e-puck
+    note: str | None  # why it cannot, where its task can
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,7 @@ class Export:
     files: tuple[str, ...]
     size: int  # of the files together, bytes
     agreement: Agreement | None  # with the policy; None where it could not be run here
-    note: str | None = None  # why it could not
+    note: str | None = None  # why it could not, or why no e-puck can be driven
     seen: float | None = None  # largest difference between an observation built from poses, if any, and the task's
 
 
@@ -77,13 +79,13 @@ def _c(job: Job) -> Files:
 
 def _numpy(job: Job) -> Files:
     source = numpy_source(job.program, _summary(job), job.description)
-    beside = {} if job.scenes is None else {"esp_epuck.py": (RUNTIME / "esp_epuck.py").read_bytes()}
+    beside = {} if job.seen is None else {"esp_epuck.py": (RUNTIME / "esp_epuck.py").read_bytes()}
     return {"policy.py": source} | beside
 
 
 def _summary(job: Job) -> str:
     """Return title, layouts and memory as plain lines, for the top of a source file."""
-    return filled("summary.txt", **job.words).decode().rstrip()
+    return escaped(filled("summary.txt", **job.words).decode().rstrip())
 
 
 FORMATS = {
@@ -127,11 +129,14 @@ def _made(trained: TrainedPolicy, formats: Sequence[str]) -> tuple[Exported, Fil
     """Make the files of an export and check each format; nothing is written yet."""
     formats = tuple(dict.fromkeys(formats))
     program = program_of(trained.policy)
+    if not program.num_inputs and (empty := {"c", "torch"}.intersection(formats)):
+        formats = " and ".join(sorted(empty))
+        raise UserError(f"{trained.source} sees no number, which {formats} cannot hold; choose onnx or numpy")
     sample = take_sample(trained, program)
     description = describe(trained, program, sample)
     drives = "robot" in description and "numpy" in formats and not program.memory_width
-    scenes = epuck.take_scenes(trained) if drives else None
-    job = Job(trained, program, sample, description, words(trained, program, description), scenes)
+    seen, note = epuck.seen_from_poses(trained, description) if drives else (None, None)
+    job = Job(trained, program, sample, description, words(trained, program, description), seen, note)
     files = {name: FORMATS[name].write(job) for name in formats}
     results = tuple(_checked(name, own, job) for name, own in files.items())
     written = {name: content for own in files.values() for name, content in own.items()}
@@ -146,6 +151,9 @@ def refuse_taken(folders: Iterable[Path], formats: Sequence[str], force: bool) -
     for folder in folders:
         if folder.exists() and not folder.is_dir():
             raise UserError(f"{folder} is a file; name a folder for the export with --out")
+        blocked = next((folder / name for name in names if (folder / name).is_dir()), None)
+        if blocked is not None:
+            raise UserError(f"{blocked} is a folder in the place of a file; move it away, or choose another --out")
         taken = [name for name in dict.fromkeys(names) if (folder / name).exists()]
         if taken and not force:
             raise UserError(
@@ -156,10 +164,11 @@ def refuse_taken(folders: Iterable[Path], formats: Sequence[str], force: bool) -
 def _put(files: Files, folder: Path) -> None:
     """Put files into a folder, each as a whole, in the place of all files of an export that is there."""
     folder.mkdir(parents=True, exist_ok=True)
-    for name in _exported(folder) - files.keys():
-        (folder / name).unlink(missing_ok=True)
+    gone = _exported(folder) - files.keys()
     for name, content in files.items():
         replace_file(folder / name, content)
+    for name in gone:
+        (folder / name).unlink(missing_ok=True)
 
 
 def _exported(folder: Path) -> set[str]:
@@ -183,10 +192,8 @@ def _checked(name: str, files: Files, job: Job) -> Export:
         agreement = compare(job.sample, form.run(folder, job.program))
         if name == "c" and not c_file.example_runs(folder):
             raise RuntimeError("the worked example of the exported C gives another action; this is a bug")
-        seen = None
-        if job.scenes is not None and name == "numpy":
-            seen = epuck.compare_scenes(job.scenes, job.description)
-    return Export(name, tuple(files), size, agreement, seen=seen)
+    note, seen = (job.note, job.seen) if name == "numpy" else (None, None)
+    return Export(name, tuple(files), size, agreement, note, seen)
 
 
 def _readme(job: Job, results: Sequence[Export]) -> bytes:
@@ -197,6 +204,6 @@ def _readme(job: Job, results: Sequence[Export]) -> bytes:
         example=[(k, shortly(v)) for k, v in example.items() if not k.startswith(("memory", "sets"))],
         results=results,
         states=epuck.STATES,
-        robot=None if job.scenes is None else job.description["robot"],
+        robot=None if job.seen is None else job.description["robot"],
     )
     return c_file.of_role(readme, job.trained.role)

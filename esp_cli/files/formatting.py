@@ -9,6 +9,7 @@ import os
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from html import escape
+from pathlib import Path
 from unicodedata import category
 
 from esp_envs.errors import UserError
@@ -38,6 +39,11 @@ def format_interval(interval: Sequence[float] | None) -> str:
         return NOTHING
     low, high = interval
     return f"[{low:.2f}, {high:.2f}]"
+
+
+def name_of(path: Path) -> str:
+    """Return the name of a file or folder, of "." too; a link keeps its own."""
+    return path.resolve().name if path.name in ("", "..") else path.name
 
 
 def file_name(text: str) -> str:

@@ -54,12 +54,18 @@ class FinalEvaluation(BaseModel):
     stochastic: SeedSummary  # returns of the policy with drawn actions
     anchors: dict[str, float]  # mean returns of reference policies: "random", "heuristic", other heuristics by name
     heuristics: tuple[str, ...] = ()  # of the task; the first is the one called "heuristic"
+    roles: tuple[str, ...] = ()  # of the agents, where they have some
     metrics: Metrics  # the task's measures of the greedy policy
     metrics_per_seed: dict[str, tuple[float | None, ...]] = {}
     anchor_metrics: dict[str, Metrics] = {}  # of each reference policy
     parameters: dict[str, int] = {}  # weights of one seed's networks by name, which is "policy"
     flops_per_action: float | None = None  # of the matrix products behind one agent's action
     over_episodes: dict[str, EpisodeSpread] = {}  # of each reference policy, and of one seed's greedy and stochastic
+
+    @property
+    def scale(self) -> dict[str, float]:
+        """The anchors by which returns are normalised; none where a return is a mean over unlike roles."""
+        return {} if self.roles else self.anchors
 
 
 def evaluate(trained: TrainedPolicy, episodes: int) -> FinalEvaluation:
@@ -95,6 +101,7 @@ def evaluate(trained: TrainedPolicy, episodes: int) -> FinalEvaluation:
         stochastic=summarise_returns(stochastic.returns),
         anchors={name: float(played.returns.mean()) for name, played in anchors.items()},
         heuristics=names,
+        roles=tuple(role.name for role in trained.spec.roles),
         metrics=_means(greedy),
         metrics_per_seed={name: summarise_returns(value).per_seed for name, value in greedy.metrics.items()},
         anchor_metrics={name: _means(played) for name, played in anchors.items()},

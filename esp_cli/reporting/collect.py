@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from esp_cli.defaults import Mode
 from esp_cli.files.documents import flat
-from esp_cli.files.formatting import format_exactly
+from esp_cli.files.formatting import format_exactly, name_of
 from esp_cli.policies.evaluation import FinalEvaluation
-from esp_cli.policies.statistics import Passing, area_under_curve, steps_to_threshold, summarise
+from esp_cli.policies.statistics import Passing, area_under_curve, steps_to_threshold
 from esp_cli.reporting.results import CellResult, Results, returns_of, summarised
 from esp_cli.studies.kinds import kind_of
 from esp_cli.studies.paper import reported
@@ -69,9 +69,8 @@ class RunCurve:
 def read_curve(path: Path, label: str | None, mode: Mode) -> RunCurve:
     """Read the evaluations of a run folder, which has to have one."""
     folder = RunFolder.open(path)
-    name = path.resolve().name if path.name in ("", "..") else path.name  # a link keeps its own name
     rows = read_metrics(folder.metrics_path)
-    curve = _curve(rows, mode, path, label or name, parse_config(folder.config, path))
+    curve = _curve(rows, mode, path, label or name_of(path), parse_config(folder.config, path))
     return replace(curve, task_version=folder.task_version())
 
 
@@ -235,10 +234,10 @@ def _results(study: Study, states: Mapping[str, _State], mode: Mode, thresholds:
     shared = {key: value for key, value in first.items() if all(c.get(key, ...) == value for c in configs.values())}
     own = {name: {key: config[key] for key in config if key not in shared} for name, config in configs.items()}
     cells = [_cell(study, cell, states[cell.name], mode, own[cell.name]) for cell in study.cells]
-    ended = {cell.name: summarise(found).mean for cell in cells if (found := returns_of(cell, mode)) is not None}
+    ended = {cell.name: float(found.mean()) for cell in cells if (found := returns_of(cell, mode)) is not None}
     for k, cell in enumerate(cells):
-        last = ended.get(cell.reference or "", ended.get(cell.name)) if cell.name in ended else None
-        limits = thresholds or ([] if last is None else [last])
+        last = ended.get(cell.reference or cell.name, math.nan) if cell.name in ended else math.nan
+        limits = thresholds or ([last] if math.isfinite(last) else [])  # not of the seeds beside one that stopped
         cells[k] = cell.model_copy(update={"steps_to": _passings(states[cell.name].curve, limits)})
     return summarised(Results(**study.model_dump(exclude={"cells"}), mode=mode, config=shared, cells=tuple(cells)))
 
@@ -253,7 +252,7 @@ def _cell(study: Study, cell: Cell, state: _State, mode: Mode, config: Mapping[s
             "task_version": final.task_version,
             "convention": final.convention,
             "returns": {"greedy": _rounded(final.greedy.per_seed), "stochastic": _rounded(final.stochastic.per_seed)},
-            "anchors": {name: round(value, _DIGITS) for name, value in final.anchors.items()},
+            "anchors": {name: round(value, _DIGITS) for name, value in final.scale.items()},
             "metrics": dict(zip(final.metrics, _rounded(final.metrics.values()), strict=True)),
         }
         if kind.network_cost:

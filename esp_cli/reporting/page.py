@@ -27,7 +27,7 @@ from esp_cli.policies.loading import TrainedPolicy
 from esp_cli.policies.statistics import CONFIDENCE, steps_to_threshold
 from esp_cli.reporting.collect import Material
 from esp_cli.reporting.figures import Style
-from esp_cli.reporting.results import MIN_SEEDS_TO_RANK, RESULTS_FORMAT, CellResult, Results, Side
+from esp_cli.reporting.results import RESULTS_FORMAT, CellResult, Results, Side
 from esp_cli.reporting.study_figures import draw_curves, draw_variants
 from esp_cli.reporting.tables import NOT_RUN, all_tables, markdown_text
 from esp_cli.studies.kinds import kind_of
@@ -87,12 +87,21 @@ def write_report(material: Material, out: Path, style: Style = "screen") -> list
     return [out / name for name in (PAGE, MARKDOWN, *(png.name for png in pictures), RESULTS)]
 
 
-def draw_films(runs: Mapping[str, Path], watch: Callable[[int], None]) -> None:
-    """Draw the policy of each trained run that has no film yet, into its folder; tell `watch` how many are done."""
+def draw_films(runs: Mapping[str, Path], watch: Callable[[int], None]) -> list[Path]:
+    """Draw the policy of each trained run that has no film yet, into its folder; tell `watch` how many are done.
+
+    Return the runs that have none, since their task does not say how it looks.
+    """
+    unseen = []
     for count, run in enumerate(runs.values(), start=1):
         if (run / POLICY).is_file() and not _film(run / FILM):
-            replace_file(run / FILM, draw_film(TrainedPolicy.read(run / POLICY), _FILM_PIXELS))
+            trained = TrainedPolicy.read(run / POLICY)
+            if trained.worlds(1, "film").has("scene"):
+                replace_file(run / FILM, draw_film(trained, _FILM_PIXELS))
+            else:
+                unseen.append(run)
         watch(count)
+    return unseen
 
 
 def draw_film(trained: TrainedPolicy, size: int, episodes: int | None = None) -> bytes:
@@ -143,6 +152,7 @@ _VERDICTS: dict[Side, str] = {
     "level": "is not told apart from",
     "blind": "is below a policy that sees nothing, as is",
 }
+_FEW = "Fewer than three seeds tell nothing for sure."
 _SCALE = "where 0 is the random policy and 1 the best hand-written one"
 
 
@@ -197,15 +207,16 @@ def _returns(results: Results, *cells: CellResult) -> str:
 
 def _verdict(cell: CellResult, other: CellResult) -> str:
     gap = None if cell.summary is None else cell.summary.gap
-    stopped = [one.variant for one in (cell, other) if one.has_stopped]
-    if gap is None and stopped:
+    if gap is None:
+        stopped = [one.variant for one in (cell, other) if one.has_stopped]
         seeds = f"a seed of {' and of '.join(stopped)} stopped"
         return f"There is no interval of the difference: {seeds}, and the others are no fair sample."
-    if gap is not None and gap.ahead is None and min(len(cell.seeds), len(other.seeds)) >= MIN_SEEDS_TO_RANK:
-        return f"{cell.variant} and {other.variant} differ by {gap.difference.value:+.2f} with every seed."
-    if gap is None or gap.ahead is None:
-        return "There is no interval of the difference, so this tells nothing for sure; take three seeds or more."
     interval = f"95 % interval {format_interval(gap.difference.ci95)}"
+    if gap.ahead is None:
+        differ = f"{cell.variant} and {other.variant} differ by {gap.difference.value:+.2f}"
+        if gap.over_all_pairs is not None:
+            return f"{differ} with every seed."
+        return f"{differ}{f', {interval}' if gap.difference.ci95 else ''}. {_FEW}"
     by = interval if gap.holm is None else f"p = {gap.holm:.3f} by the rank-sum test"
     return (
         f"{cell.variant} {_VERDICTS[gap.ahead]} {other.variant}: the difference is {gap.difference.value:+.2f}, {by}."
@@ -262,18 +273,17 @@ def _reached(results: Results, threshold: float) -> str:
 
 def _count(pairs: list[tuple[CellResult, CellResult]]) -> list[str]:
     gaps = [(cell, cell.summary.gap) for cell, _ in pairs if cell.summary is not None and cell.summary.gap is not None]
-    sides = Counter(gap.ahead for _, gap in gaps)
-    if set(sides) <= {None}:
-        return [_verdict(*pairs[0])]
+    if not gaps:
+        return []
+    sides = Counter(gap.ahead for _, gap in gaps if gap.over_all_pairs is not None)
     counts = f"better {sides['ahead']}, not told apart {sides['level']}, worse {sides['behind']}"
     counts += f", both below a policy that sees nothing {sides['blind']}" if sides["blind"] else ""
-    number = sides.total() - sides[None]
-    texts = [f"Of {number} run{'s'[: number - 1]} beside their reference: {counts} (95 % intervals of the difference)."]
-    if gaps:
-        ordered = sorted(gaps, key=lambda pair: pair[1].difference.value)
-        largest, smallest = (
-            f"{gap.difference.value:+.2f} {format_interval(gap.difference.ci95)} ({cell.variant}; {cell.panel})"
-            for cell, gap in (ordered[-1], ordered[0])
-        )
-        texts.append(f"The largest difference is {largest}, the smallest {smallest}.")
-    return texts
+    counts += f", by the same with every seed {sides[None]}" if sides[None] else ""
+    number = sides.total()
+    told = f"Of {number} run{'s'[: number - 1]} beside their reference: {counts} (95 % intervals of the difference)."
+    ordered = sorted(gaps, key=lambda pair: pair[1].difference.value)
+    largest, smallest = (
+        f"{gap.difference.value:+.2f} {format_interval(gap.difference.ci95)} ({cell.variant}; {cell.panel})"
+        for cell, gap in (ordered[-1], ordered[0])
+    )
+    return [told if number else _FEW, f"The largest difference is {largest}, the smallest {smallest}."]

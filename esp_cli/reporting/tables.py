@@ -11,8 +11,9 @@ from typing import TypeVar
 
 from pydantic import JsonValue
 
+from esp_cli.defaults import Mode
 from esp_cli.files.formatting import NOTHING, format_count, format_duration, format_interval, format_mean, format_span
-from esp_cli.policies.statistics import Estimate, SeedSummary, median_steps, summarise
+from esp_cli.policies.statistics import Estimate, Interval, Passing, SeedSummary, median_steps, summarise
 from esp_cli.reporting.results import CellResult, CellSummary, Gap, Results, floats
 from esp_cli.studies.kinds import kind_of
 
@@ -162,11 +163,11 @@ def steps_table(results: Results) -> Table:
         for passing in cell.steps_to:
             never = math.nan if cell.has_stopped else math.inf
             mean = never if passing.of_mean is None else passing.of_mean
-            median, interval = median_steps(passing.per_seed)
+            median, interval = _median_steps(cell, results.mode, passing)
             span = f"[{', '.join(_within(end, cell.step) for end in interval)}]" if interval else NOTHING
             reached = (_within(mean, cell.step), _within(median, cell.step), span)
             theirs = [p for p in reference.steps_to if p.threshold == passing.threshold and reference is not cell]
-            ratio = _share(median, median_steps(theirs[0].per_seed)[0]) if theirs else ""
+            ratio = _share(median, _median_steps(reference, results.mode, theirs[0])[0]) if theirs else ""
             shares = (_share(median, reference.step), ratio)
             rows.append((cell.panel, cell.variant, f"{passing.threshold:.2f}", *reached, *shares))
     caption = (
@@ -273,6 +274,13 @@ def _is_plain(config: Mapping[str, JsonValue]) -> bool:
     """Return whether a run, by its settings with dotted names, has no symmetry in its prior or its network."""
     symmetric = config.get("network.name") in ("equivariant", "empn") or config.get("network.symmetrise")
     return config.get("prior.kind") == "none" and not symmetric
+
+
+def _median_steps(cell: CellResult, mode: Mode, passing: Passing) -> tuple[float, Interval | None]:
+    """Return median and interval; not a number where a seed stopped before it got there: nobody knows when it had."""
+    ends = cell.returns.get(mode, ())
+    unknown = any(steps is end is None for steps, end in zip(passing.per_seed, ends, strict=False))
+    return (math.nan, None) if unknown else median_steps(passing.per_seed)
 
 
 def _share(steps: float, of: float) -> str:

@@ -214,7 +214,8 @@ def test_what_is_no_file_run_or_task_is_refused(tmp_path: Path) -> None:
     assert "is not an intact .npz file" in refused("discover", junk, "--task", "navigation")
     assert "does not say what its numbers are; add --task" in refused("discover", recorded(tmp_path))
     navigation = ("--task", "navigation")
-    assert "there is no file" in refused("discover", tmp_path / "none.npz", *navigation)
+    for task in ((), navigation):
+        assert "there is no file" in refused("discover", tmp_path / "none.npz", *task)
     forces = ("--set", "task.actions=continuous")
     assert "'obs' of" in refused("discover", recorded(tmp_path, obs=np.zeros(64)), *navigation, *forces)
     scalar = recorded(tmp_path, action=np.zeros((1536, 8, 3), int), action_mask=np.array(True))
@@ -298,7 +299,9 @@ def test_training_takes_what_it_discovers_and_a_run_is_looked_at_with_its_settin
         == "discovered:flip-x*agents*landmarks-3"
     )
     assert "found flip-x*agents*landmarks-3" in esp("discover", folder).stdout
-    assert "is a run of navigation, and --task says wildlife" in refused("discover", folder, "--task", "wildlife")
+    assert "--task wildlife changes nothing here, where the task is navigation" in refused(
+        "discover", folder, "--task", "wildlife"
+    )
     esp("train", "--resume", folder)
 
 

@@ -15,7 +15,7 @@ from tests.cli.running import DAMAGE, edit_config, esp, refused, train_tiny
 
 DOCUMENTED = {"task", "task_version", "convention", "episodes", "greedy", "stochastic", "anchors", "metrics"}
 BESIDE = {"esp_version", "source", "step", "seeds", "heuristics", "metrics_per_seed", "anchor_metrics", "task_settings"}
-BESIDE |= {"over_episodes", "parameters", "flops_per_action"}
+BESIDE |= {"roles", "over_episodes", "parameters", "flops_per_action"}
 
 
 def test_the_result_has_the_documented_keys_and_its_parts_agree(finished: Path, tmp_path: Path) -> None:
@@ -169,3 +169,12 @@ def test_a_policy_is_taken_where_its_last_checkpoint_is_damaged(copied: Path) ->
     told = esp("eval", copied, "--episodes", 2)
     assert f"taking {copied / 'policy.safetensors'}" in " ".join(told.stderr.split())
     assert "too narrow" in " ".join(told.stdout.split())
+
+
+def test_a_mean_over_unlike_roles_is_not_normalised(tmp_path: Path) -> None:
+    options = ("--task", "predator-prey", "--prior", "none", "--seed-list", "3", "--set", "task.horizon=5")
+    for control, has_scale in (("both", False), ("predators", True)):
+        run = train_tiny(tmp_path / control, *options, "--set", f"task.control={control}", steps=60)
+        told = esp("eval", run, "--episodes", "2")
+        assert ("normalised" in told.stdout) == has_scale
+        assert "heuristic chase" in told.stdout

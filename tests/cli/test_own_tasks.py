@@ -74,6 +74,30 @@ def test_a_run_alone_imports_nothing_and_says_what_to_add(folder: Path, words: l
     assert len(result.stderr.strip().splitlines()) == 1
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["eval", "navigation"],
+        ["render", "navigation", "-o", "f.gif"],
+        ["export", "navigation", "-f", "numpy", "-o", "e"],
+        ["report", "plain"],
+        ["discover", "plain"],
+    ],
+    ids=lambda words: words[0],
+)
+def test_a_task_that_nothing_given_has_is_refused(folder: Path, words: list[str]) -> None:
+    if not (folder / "plain").exists():
+        esp(folder, "train", "--out", "plain", "--network", "mlp", *SHORT)
+    told = esp(folder, *words, "--task", TASK, code=2).stderr
+    assert f"error: --task {TASK} changes nothing here, where the task is navigation; leave it out" in told
+
+
+def test_a_network_without_a_policy_to_check_is_refused(folder: Path) -> None:
+    network = "esp_cli.networks.sets:SetConfig"
+    told = esp(folder, "check", "symmetry", TASK, "--network", network, code=2).stderr
+    assert f"error: --network {network} changes nothing here; leave it out" in told
+
+
 def test_a_program_loads_such_a_policy_by_naming_its_task(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from esp_envs import registry
 

@@ -1,6 +1,7 @@
 """`esp render`: films and pictures of the right length, size and speed; one sentence for whatever cannot be drawn."""
 
 import re
+import shutil
 from pathlib import Path
 
 import pytest
@@ -72,9 +73,25 @@ def test_a_picture_for_print_is_as_wide_as_asked_for_and_has_its_letters_embedde
     assert "leave out --width" in refused("render", finished, "-o", tmp_path / "film.gif", "--width", 89)
 
 
-def test_frames_per_second_of_a_picture_are_refused(finished: Path, tmp_path: Path) -> None:
-    said = refused("render", finished, "-o", tmp_path / "picture.png", "--fps", 10)
-    assert "is a picture without frames; leave out --fps" in said
+@pytest.mark.parametrize(
+    ("kind", "options", "sentence"),
+    [
+        ("png", ["--fps", 10], "is a picture without frames; leave out --fps"),
+        ("png", ["--speed", "4x"], "is a picture without frames; leave out --speed"),
+        ("pdf", ["--size", 200], "is for print, whose width --width sets in mm; leave out --size"),
+        ("png", ["--size", 200, "--width", 89], "is for print, whose width --width sets in mm; leave out --size"),
+    ],
+)
+def test_what_a_picture_does_not_have_is_refused(finished, tmp_path, kind, options, sentence):
+    assert sentence in refused("render", finished, "-o", tmp_path / f"picture.{kind}", *options)
+
+
+def test_policies_of_one_name_are_told_apart_and_a_folder_has_its_name(finished, tmp_path, monkeypatch):
+    runs = [shutil.copytree(finished, tmp_path / name / "run") for name in "ab"]
+    told = esp("render", *runs, "-o", tmp_path / "both.png", "--size", 64).stderr
+    assert all(f"{run}: return" in told for run in runs)
+    monkeypatch.chdir(runs[0])
+    assert "run: return" in esp("render", ".", "-o", tmp_path / "one.png", "--size", 64).stderr.splitlines()[-1]
 
 
 @pytest.mark.parametrize(

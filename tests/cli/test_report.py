@@ -135,6 +135,7 @@ def test_one_seed_and_a_step_not_reached_are_dashes(tmp_path: Path, finished: Pa
 
 def test_options_of_what_is_not_written_are_refused(finished: Path) -> None:
     assert "add --out FOLDER" in refused("report", finished, "--films")
+    assert "--style is of the figures that --out or --plot writes" in refused("report", finished, "--style", "paper")
 
 
 def test_a_folder_may_have_an_equals_sign_in_its_name(finished: Path, copied: Path) -> None:

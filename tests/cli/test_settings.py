@@ -78,3 +78,4 @@ def test_a_task_of_ones_own_has_settings_too(tmp_path: Path, monkeypatch: pytest
 def test_a_name_without_settings_is_one_sentence() -> None:
     assert refused("settings", "mapo") == "nothing with settings is called 'mapo'; did you mean 'mappo'?"
     assert "there is mappo, maddpg, qmix, navigation" in refused("settings", "colour")
+    assert "quadruped" in refused("settings", "colour"), "which is listed alone"

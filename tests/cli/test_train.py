@@ -104,6 +104,7 @@ def test_transforms_without_a_prior_and_options_of_other_programs_are_answered()
     }.items():
         assert f"No such option: {option}; " in (message := refused("train", option, "3"))
         assert told in message
+        assert told not in refused("eval", "navigation", option, "3"), "which has no such option"
     assert "did you mean 'navigation'?" in refused("train", "--task", "simple_spread")
 
 

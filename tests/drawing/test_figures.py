@@ -45,6 +45,14 @@ def test_paths_are_drawn_where_they_went_more_opaque_with_time():
     assert color(0.05, -0.6) == [255, 255, 255], "a body that leaves no trail has none"
 
 
+def test_a_strip_takes_bodies_that_come_and_go():
+    start, *others, end = line(4, trail=False)
+    more = replace(end, bodies=(*end.bodies, Body((0.0, 0.0), 0.2, GREEN)))
+    figure = figure_of(strip, [start, *others, more, end])
+    patches = [len(axes.patches) for axes in figure.axes if axes.axison]
+    assert patches == [2, 2, 2, 3, 2]
+
+
 def test_paths_show_the_start_the_end_and_what_stands():
     _, color = drawn(figure_of(paths, line()))
     assert color(-0.8, -0.6) == [255, 0, 0], "the mark of the start is opaque"

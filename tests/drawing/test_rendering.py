@@ -106,6 +106,20 @@ def test_seeds_and_noise_make_other_recordings_and_the_same_choice_the_same(trai
     assert filmed(trained, 3, 1) != filmed(trained, 3, 1, False)
 
 
+def test_an_episode_begins_alike_however_much_chance_the_one_before_had(trained, monkeypatch):
+    first, second = filmed(trained, 3, 2)
+    kind = type(build_environment(trained.config, 1, "film"))
+    step = kind.step
+
+    def with_chance(env, action):
+        torch.rand(1, generator=env.generators[0])
+        return step(env, action)
+
+    monkeypatch.setattr(kind, "step", with_chance)
+    assert filmed(trained, 3, 2) == [first, second]
+    assert first.scenes[0] != second.scenes[0]
+
+
 def test_an_episode_that_ends_early_ends_the_recording(trained, monkeypatch):
     kind = type(build_environment(trained.config, 1, "film"))
     step = kind.step

@@ -1,14 +1,20 @@
 """What surrounds an exported policy on an e-puck: observations from poses and safety stops."""
 
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from esp_cli.export import check, epuck
 from esp_cli.export.esp_epuck import PATIENCE_S, Pilot
 from esp_cli.export.export import export
-from tests.export.policies import drawn_policy
+from esp_envs import Field, Kind, layout
+from esp_envs.epuck.formation import Formation
+from esp_envs.registry import TASKS
+from tests.export.policies import KINDS, drawn_policy
 
 SETTINGS = {
     "offset": {},
@@ -44,14 +50,49 @@ def test_an_observation_that_is_built_wrongly_is_found() -> None:
     assert epuck.compare_scenes(scenes, description) < 1e-6
     for part, wrong in (("fading_m", 0.201), ("body_radius_m", 0.038)):
         spoilt = description | {"robot": description["robot"] | {part: wrong}}
-        with pytest.raises(RuntimeError, match="differs from the task's"):
+        with pytest.raises(ValueError, match="differs from the task's"):
             epuck.compare_scenes(scenes, spoilt)
     swapped = description | {"observation": description["observation"][::-1]}
-    with pytest.raises(RuntimeError, match="differs from the task's"):
+    with pytest.raises(ValueError, match="differs from the task's"):
         epuck.compare_scenes(scenes, swapped)
     unseen = (*scenes[:-1], np.full_like(scenes[-1], np.nan))
-    with pytest.raises(RuntimeError, match="differs from the task's by nan"):
+    with pytest.raises(ValueError, match="differs from the task's by nan"):
         epuck.compare_scenes(unseen, description)
+
+
+class Battery(Formation):
+    """Formation change in which each robot also sees its battery."""
+
+    def _describe(self):
+        spec = super()._describe()
+        return replace(spec, observation=layout(*spec.observation.fields, Field("battery", Kind.SCALAR, 1, "")))
+
+    def _observe(self, world):
+        seen = super()._observe(world).flatten(-2)
+        return torch.cat([seen, torch.ones_like(seen[..., :1])], -1)
+
+
+class Scaled(Formation):
+    """Formation change in half the unit."""
+
+    def _observe(self, world):
+        return 2 * super()._observe(world)
+
+
+class Same(Formation):
+    """Formation change as it is."""
+
+
+@pytest.mark.usefixtures("few_scenes")
+@pytest.mark.parametrize(
+    ("task", "told"),
+    [(Battery, "sees: battery; esp_epuck.py is left out"), (Scaled, "by .*; esp_epuck.py is left out"), (Same, None)],
+)
+def test_a_task_of_ones_own_that_shows_other_numbers_goes_out_without_poses(task, told, tmp_path, monkeypatch):
+    monkeypatch.setitem(KINDS, "own", (TASKS.register(task), "mappo", {}))
+    (written,) = export(drawn_policy("own"), ["numpy"], tmp_path).formats
+    assert (told is None) == (tmp_path / "esp_epuck.py").exists() == (written.note is None)
+    assert told is None or re.search(told, written.note)
 
 
 def described(trained) -> dict:

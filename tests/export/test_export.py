@@ -15,7 +15,10 @@ from esp_cli.export.check import compare, take_sample
 from esp_cli.export.export import FORMATS, export
 from esp_cli.export.numpy_policy import NumpyPolicy
 from esp_cli.export.program import program_of
+from esp_envs.errors import UserError
+from esp_envs.registry import TASKS
 from tests.export.policies import KINDS, drawn_policy, imported
+from tests.own_tasks import save_page_files
 
 pytestmark = pytest.mark.usefixtures("few_scenes")
 FAST = ("numpy", "c")
@@ -189,6 +192,39 @@ def test_every_export_says_what_its_numbers_are(tmp_path: Path) -> None:
     stored = {item.key: item.value for item in model.metadata_props}
     assert json.loads(stored["esp"])["example"] == example
     assert "heading: vector x 1 (direction)" in (tmp_path / "policy.h").read_text()
+
+
+@needs_cc
+def test_a_name_with_a_control_of_direction_is_escaped_in_sources(tmp_path: Path) -> None:
+    trained = drawn_policy("choice")
+    first, *others = trained.spec.observation.fields
+    seen = replace(trained.spec.observation, fields=(replace(first, name="\u202eabc"), *others))
+    export(replace(trained, spec=replace(trained.spec, observation=seen)), FAST, tmp_path)
+    for source in ("policy.h", "policy.py"):
+        text = (tmp_path / source).read_text()
+        assert "\u202e" not in text
+        assert "u202eabc" in text
+
+
+def test_a_policy_that_sees_no_number_goes_out_where_a_format_holds_it(tmp_path, monkeypatch):
+    save_page_files(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(KINDS, "alone", (TASKS.register("rendezvous:Rendezvous"), "mappo", {}))
+    trained = drawn_policy("alone", num_agents=1)
+    with pytest.raises(UserError, match="sees no number, which c and torch cannot hold; choose onnx or numpy"):
+        export(trained, ["numpy", "torch", "c"], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    assert export(trained, ["numpy"], tmp_path / "out").formats[0].agreement.max_difference < 1e-5
+
+
+def test_an_export_that_cannot_be_written_leaves_the_one_before(tmp_path: Path) -> None:
+    trained = drawn_policy("choice")
+    export(trained, ["numpy"], tmp_path)
+    before = (tmp_path / "policy.py").read_bytes()
+    (tmp_path / "policy.onnx").mkdir()
+    with pytest.raises(UserError, match=r"policy\.onnx is a folder in the place of a file"):
+        export(trained, ["onnx"], tmp_path, force=True)
+    assert (tmp_path / "policy.py").read_bytes() == before
 
 
 def test_an_onnx_export_without_its_libraries_names_them(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -312,16 +312,20 @@ def test_the_ros_node_drives_as_the_policy_does(tmp_path: Path, monkeypatch: pyt
         node.callback(ros_poses(lost))
         node.tick()
         assert node.speeds() == [[0.0, 0.0]] * 8, "one robot is lost"
-        node.callback(ros_poses(team.poses, stamp_s=1))
+        node.callback(ros_poses(team.poses, stamp_s=5))
         node.tick()
         assert node.speeds()[0] != [0.0, 0.0]
         node.now_s += 0.6
-        node.callback(ros_poses(team.poses, stamp_s=1))
+        node.callback(ros_poses(team.poses, stamp_s=5))
         node.tick()
         assert node.speeds()[0] == [0.0, 0.0], "a tracker that repeats itself tells nothing"
-        node.callback(ros_poses(team.poses, stamp_s=2))
+        node.callback(ros_poses(team.poses, stamp_s=6))
         node.tick()
         assert node.speeds()[0] != [0.0, 0.0]
+        for node.now_s, stamp_s, drives in ((67.0, 7, False), (67.0, 67, True)):
+            node.callback(ros_poses(team.poses, stamp_s))
+            node.tick()
+            assert (node.speeds()[0] != [0.0, 0.0]) == drives, "poses are as old as their stamp says"
         nodes.append(node)
         raise KeyboardInterrupt
 

@@ -11,9 +11,11 @@ from esp_cli.studies.study import StudyFolder
 from tests.studies.small_studies import small_study, write_run
 
 
-def answered(path: Path, plain: list[list[float | None]], ours: list[list[float | None]]) -> list[str]:
+def answered(
+    path: Path, plain: list[list[float | None]], ours: list[list[float | None]], seeds: tuple[int, ...] = (0, 1, 2)
+) -> list[str]:
     """The answer on a study of two runs with these evaluations at 0 and 100 and the last as the final evaluation."""
-    folder = StudyFolder.create(path, small_study())
+    folder = StudyFolder.create(path, small_study(seeds=seeds))
     for cell, rows in zip(folder.study.cells, (plain, ours), strict=True):
         write_run(folder, cell, rows, rows[-1])
     return answer(collect_study(folder))
@@ -96,8 +98,30 @@ def test_of_several_runs_the_better_and_the_worse_are_counted(tmp_path: Path) ->
 
 def test_of_several_runs_of_two_seeds_nothing_is_counted(tmp_path: Path) -> None:
     folder = StudyFolder.create(tmp_path / "s", small_study("ablate-modules", algorithms=("mappo",), seeds=(0, 1)))
-    for cell in folder.study.cells:
-        write_run(folder, cell, [[-200.0] * 2, [-150.0] * 2], [-150.0, -140.0])
-    assert answer(collect_study(folder)) == [
-        "There is no interval of the difference, so this tells nothing for sure; take three seeds or more."
-    ]
+    for k, cell in enumerate(folder.study.cells):
+        write_run(folder, cell, [[-200.0] * 2, [-150.0] * 2], [-150.0, -140.0 + k])
+    few, extremes = answer(collect_study(folder))
+    assert few == "Fewer than three seeds tell nothing for sure."
+    assert extremes.startswith("The largest difference is +1.50 [0.00, 3.00] (both; ")
+
+
+def test_a_difference_of_two_seeds_is_told_with_its_interval(tmp_path: Path) -> None:
+    _, second, *_ = answered(tmp_path / "s", [[-200.0] * 2, [-160.0] * 2], [[-150.0] * 2, [-120.0, -118.0]], (0, 1))
+    assert second == (
+        "MAPPO-ESP and MAPPO differ by +41.00, 95 % interval [40.00, 42.00]. "
+        "Fewer than three seeds tell nothing for sure."
+    )
+    _, second, *_ = answered(tmp_path / "t", [[-200.0] * 2, [-160.0] * 2], [[-150.0] * 2, [-120.0] * 2], (0, 1))
+    assert second == "MAPPO-ESP and MAPPO differ by +40.00. Fewer than three seeds tell nothing for sure."
+
+
+def test_runs_that_differ_alike_with_every_seed_are_counted_among_several(tmp_path: Path) -> None:
+    folder = StudyFolder.create(tmp_path / "s", small_study("ablate-modules", algorithms=("mappo",)))
+    for cell, ends in zip(
+        folder.study.cells, ([-160.0] * 3, [-160.0] * 3, [-159.0] * 3, [-150.0, -151.0, -149.0]), strict=True
+    ):
+        write_run(folder, cell, [[-200.0] * 3, ends], ends)
+    assert answer(collect_study(folder))[0] == (
+        "Of 3 runs beside their reference: better 1, not told apart 0, worse 0, by the same with every seed 2 "
+        "(95 % intervals of the difference)."
+    )

@@ -11,8 +11,12 @@ from PIL import Image
 
 from esp_cli.drawing.films import write_gif
 from esp_cli.reporting.collect import Material, collect_study
-from esp_cli.reporting.page import write_report
+from esp_cli.reporting.page import FILM, draw_films, write_report
 from esp_cli.reporting.tables import Table, markdown_text
+from esp_cli.training.folder_names import POLICY
+from esp_envs.base import Environment
+from esp_envs.registry import task_class
+from tests.export.policies import drawn_policy, write_policy
 from tests.site.browser import BROWSER, DESKTOP, PHONE, complaints
 from tests.studies.small_studies import small_study, write_study
 
@@ -187,3 +191,15 @@ def test_nothing_is_scrolled_sideways(page: Path, width: int, tmp_path: Path) ->
     wide.write_text(page.read_text().replace(cards, "").replace("<style>", f"{rows}td {{ min-width: 900px; }} "))
     (tmp_path / "again").mkdir()
     assert "sideways" in "".join(complaints([wide], width, tmp_path / "again"))
+
+
+def test_a_run_whose_task_does_not_draw_itself_has_no_film_and_the_others_have(tmp_path, monkeypatch):
+    runs = {name: tmp_path / name for name in ("unseen", "seen")}
+    for kind, run in zip(("choice", "wheels"), runs.values(), strict=True):
+        run.mkdir()
+        write_policy(drawn_policy(kind, **({"horizon": 2} if kind == "wheels" else {})), run / POLICY)
+    monkeypatch.setattr(task_class("navigation"), "scene", Environment.scene)
+    done = []
+    assert draw_films(runs, done.append) == [runs["unseen"]]
+    assert [(run / FILM).exists() for run in runs.values()] == [False, True]
+    assert done == [1, 2]

@@ -105,6 +105,19 @@ def test_a_probability_of_improvement_and_a_verdict_need_three_shared_seeds(tmp_
     assert column(found, "comparison", "minus reference>")[1].startswith("+6.00" if verdict == "yes" else "+5.50")
 
 
+def test_a_stopped_seed_sets_no_threshold_and_leaves_the_median_unknown(tmp_path):
+    ends = [-110.0, None, -100.0]
+    found = collect_study(write_study(tmp_path / "a", small_study(), {"MAPPO": ends, "MAPPO-ESP": ESP})).results
+    assert [cell.steps_to for cell in found.cells] == [(), ()], "the seeds beside one that stopped are no fair sample"
+    found = collect_study(write_study(tmp_path / "b", small_study(), {"MAPPO": PLAIN, "MAPPO-ESP": ends})).results
+    plain, esp = found.cells
+    assert column(found, "steps", "median seed>") == ["200", "-"], "it may have got there"
+    assert column(found, "steps", "ratio of median steps>") == ["", "-"]
+    whole = esp.model_copy(update={"returns": dict.fromkeys(esp.returns, (-110.0, -400.0, -100.0))})
+    never = found.model_copy(update={"cells": (plain, whole)})
+    assert column(never, "steps", "median seed>")[1] != "-", "a seed that went on and never got there is late"
+
+
 def test_other_thresholds_can_be_asked_for(tmp_path):
     folder = write_study(tmp_path / "s", small_study(), {"MAPPO": PLAIN})
     plain = collect_study(folder, thresholds=[-180.0, 0.0]).results.cells[0]
