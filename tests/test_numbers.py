@@ -81,7 +81,8 @@ def recorded(file: Path) -> frozenset[float]:
                 groups[key.rstrip("0123456789")].append(end_of(rows))
             for ends in groups.values():
                 found.update(number for column in zip(*ends, strict=True) for number in summary(list(column)))
-            scores, anchors = value.get("greedy"), value.get("anchors") or {}
+            of_study = value["returns"] if isinstance(value.get("returns"), dict) else value
+            scores, anchors = of_study.get("greedy"), value.get("anchors") or {}
             if scores and "heuristic" in anchors:
                 low, span = anchors["random"], anchors["heuristic"] - anchors["random"]
                 seeds = scores["per_seed"] if isinstance(scores, dict) else scores
