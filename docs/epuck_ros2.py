@@ -13,7 +13,8 @@ Parameters
     pillars (list of x, y of each, m): by default none.
 
 Robots stand still until the first poses come, when no new ones came for half a second, and when a number is not
-finite. Poses are as old as their time stamp says, where they have one; of the stamp of those before they are not new.
+finite. Poses are as old as their time stamp says, where they have one, so the tracker's clock has to be the node's;
+with the stamp of the last ones they are not new.
 """
 
 from __future__ import annotations

@@ -102,10 +102,9 @@ def _called(function: Callable[..., Any], numbers: Numbers, rows: dict[str, Tens
     terms = {group: [field.name for field in numbers[group].fields] for group in groups}
     env = SimpleNamespace(observation_manager=SimpleNamespace(active_terms=terms))
     env.unwrapped = env
-    values = dict.fromkeys((*_OBS, *_ACTIONS, "env"))
-    known = {name: None for name in takes if name in values}
-    if any(one.kind is one.VAR_KEYWORD for one in takes.values()):
-        known |= dict.fromkeys(("env", "obs", "actions"))
+    known = [name for name in takes if name in (*_OBS, *_ACTIONS, "env")]
+    if any(one.kind is one.VAR_KEYWORD for one in takes.values()) and ("env" in known or len(takes) == 1):
+        known += [name for name in ("env", "obs", "actions") if name not in known]  # as rsl_rl calls it
 
     def call(seen: Any) -> Any:
         given = dict.fromkeys(_OBS, seen) | dict.fromkeys(_ACTIONS, rows[ACTION].clone()) | {"env": env}
@@ -119,7 +118,7 @@ def _called(function: Callable[..., Any], numbers: Numbers, rows: dict[str, Tens
         except (Exception, SystemExit) as error:
             errors.append(error)
     else:
-        why = last_line(errors[0])  # of the tensor, which most functions take
+        why = last_line(errors[0])
         raise UserError(f"the function raises {why}; it was given {', '.join(known) or ACTION}") from errors[0]
     results = tuple(result) if isinstance(result, tuple | list) else (result,)
     if not (seeing := set(known) & set(_OBS)):

@@ -9,7 +9,6 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
 
 from esp_cli.symmetry.elements import Floats
 from esp_envs.errors import UserError
@@ -49,8 +48,8 @@ class Frame:
         roots = [int(model.jnt_bodyid[free[0]])] if free else self.children[0]
         self.centre = data.xpos[roots].mean(0)
         self.centre[2] = 0
-        slides = SLIDE in model.jnt_type[self.joints(roots[0])] and model.body_dofnum[roots[0]] > 1
-        is_base = bool(free) or (len(roots) == 1 and slides)
+        kinds = set(model.jnt_type[self.joints(roots[0])])
+        is_base = bool(free) or (len(roots) == 1 and SLIDE in kinds and bool(kinds & {BALL, HINGE}))
         self.axes = data.xmat[roots[0]].reshape(3, 3).copy() if is_base else np.eye(3)
         self.places = np.stack([data.xpos, data.xipos], 1) - self.centre
         self.anchor, self.axis = data.xanchor - self.centre, data.xaxis.copy()
@@ -127,11 +126,9 @@ class Frame:
         """Return the second moments [3, 3] of a mesh's convex hull, with which it touches, however it is meshed."""
         start = int(self.model.mesh_vertadr[mesh])
         points = self.model.mesh_vert[start : start + int(self.model.mesh_vertnum[mesh])].astype(np.float64)
-        middle = points.mean(0)
-        try:
-            corners = points[ConvexHull(points).simplices] - middle  # [faces, 3, 3]: with the middle, tetrahedra
-        except QhullError:  # it is flat
-            return np.cov(points.T, bias=True) + np.outer(middle, middle)
+        middle, graph = points.mean(0), self.model.mesh_graph[int(self.model.mesh_graphadr[mesh]) :]
+        faces = 2 + 3 * int(graph[0] + graph[1])  # where the corners of the hull's faces are
+        corners = points[graph[faces : faces + 3 * int(graph[1])].reshape(-1, 3)] - middle  # with it, tetrahedra
         volume, total = np.abs(np.linalg.det(corners)), corners.sum(1)
         volume /= volume.sum()
         spread = np.einsum("f,fvi,fvj->ij", volume, corners, corners) + np.einsum("f,fi,fj->ij", volume, total, total)

@@ -50,7 +50,7 @@ def turning(actor: Actor, body: Body, numbers: Numbers, rows: Floats | None = No
     rows = _drawn(seen) if rows is None else rows
     if rows.ndim != 2 or rows.shape[1] != seen.width or not np.isfinite(rows).all():
         raise UserError(f"the rows have shape {list(rows.shape)}; give finite numbers [M, {seen.width}] of states")
-    if len(np.unique(rows, axis=0)) < 2:
+    if (rows == rows[:1]).all():
         raise UserError("the rows are all the same, so none is unrelated to another; give rows of several states")
     labels = labels_of(numbers[ACTION])
     here, found = _acted(actor, rows, len(labels)), []

@@ -97,6 +97,7 @@ def check(
     elif spec.roles:
         if policy is not None:
             raise UserError(f"{task} has roles, of whose policies nothing is measured here; leave --policy out")
+        options.refuse_unused([], None, algo, network)
         code = _check_roles(spec, make_worlds, transforms, seconds, json)
     else:
         code = _check_symmetry(make_worlds, transforms, _opened(policy, algo, network), seconds, json)

@@ -133,7 +133,8 @@ def strip(figure: SubFigure, episode: Episode, title: str, period_s: float) -> N
         axes.set_title(f"{k * period_s:g} s{', end' if k == episode.steps else ''}", fontsize="small")
         for body in scene.bodies:
             _add_body(axes, body, small=True)
-        for before, body in zip(episode.scenes[max(0, k - 1)].bodies, scene.bodies, strict=False):  # some come or go
+        earlier = episode.scenes[max(0, k - 1)].bodies
+        for before, body in zip(earlier, scene.bodies, strict=True) if len(earlier) == len(scene.bodies) else ():
             if 0 < math.dist(before.position, body.position) <= 2 * scene.grid[0]:  # not round the torus
                 arrow = {"arrowstyle": "->", "color": body.color, "linewidth": 1.2}
                 axes.annotate("", body.position, before.position, arrowprops=arrow, zorder=2)

@@ -115,7 +115,7 @@ class CheckedTransform(Transform):
         """Let a number per agent, [..., N] or [..., N, 1], move with it; one per row, [...] or [..., 1], stays."""
         return self._carried(super().per_agent, x, name)
 
-    def values(self, values: Tensor, name: str = "value") -> Tensor:
+    def values(self, values: Tensor, name: str = "the policy's output") -> Tensor:
         """Return values per agent, [..., N] or [..., N, 1], to their agents; one per row stays."""
         return self._carried(super().values, values, name)
 

@@ -218,7 +218,7 @@ class Symmetry(Draws):
             raise UserError("value_loss takes either state or obs; give the one that the critic sees")
         here = value(data) if here is None else here
         transforms = self.transforms(data, lead)
-        carried = [g.values(value(g.obs(data) if state is None else g.state(data))) for g in transforms]
+        carried = [g.values(value(g.obs(data) if state is None else g.state(data)), "value") for g in transforms]
         check_alike("value", carried, here)
         return mean_counted([value_consistency_loss(x, here) for x in carried], mask)
 

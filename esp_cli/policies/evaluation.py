@@ -29,7 +29,6 @@ from esp_envs.base import BLIND
 from esp_envs.errors import UserError
 from esp_envs.registry import TASKS
 
-MAX_WORLDS = 4096  # played at once, over all seeds; more episodes are played one batch after the other
 _ROUGH_AGENT_STEPS, _ROUGH_ERROR = 5000, 0.1
 """Of each reference policy where a second has to do, and the largest standard error, as a share of their scale."""
 _STREAM = "judgement"  # names the worlds; the word decides the numbers of every final evaluation, so it stays
@@ -173,14 +172,10 @@ def _means(episodes: Episodes) -> Metrics:
 
 
 def play_batches(config: RunConfig, controller: Controller, stream: str, episodes: int) -> Episodes:
-    """Play episodes (so many per seed) in batches whose worlds depend on the seeds, the stream and the batch alone.
-
-    Up to `EPISODES` are one batch, so that a seed has the same worlds beside any number of other seeds.
-    """
+    """Play episodes (so many per seed) in batches of worlds: a seed has the same ones beside any number of others."""
     parts = []
-    batch = min(episodes, max(EPISODES, MAX_WORLDS // len(config.seeds)))
-    for begin in range(0, episodes, batch):
-        env = build_environment(config, min(batch, episodes - begin), _STREAM, stream, begin)
+    for begin in range(0, episodes, EPISODES):
+        env = build_environment(config, min(EPISODES, episodes - begin), _STREAM, stream, begin)
         parts.append(play(env, controller))
     return Episodes(
         torch.cat([p.returns for p in parts], 1),

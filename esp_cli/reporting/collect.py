@@ -252,7 +252,8 @@ def _cell(study: Study, cell: Cell, state: _State, mode: Mode, config: Mapping[s
             "task_version": final.task_version,
             "convention": final.convention,
             "returns": {"greedy": _rounded(final.greedy.per_seed), "stochastic": _rounded(final.stochastic.per_seed)},
-            "anchors": {name: round(value, _DIGITS) for name, value in final.scale.items()},
+            "anchors": {name: round(value, _DIGITS) for name, value in final.anchors.items()},
+            "roles": final.roles,
             "metrics": dict(zip(final.metrics, _rounded(final.metrics.values()), strict=True)),
         }
         if kind.network_cost:

@@ -283,7 +283,8 @@ def _count(pairs: list[tuple[CellResult, CellResult]]) -> list[str]:
     told = f"Of {number} run{'s'[: number - 1]} beside their reference: {counts} (95 % intervals of the difference)."
     ordered = sorted(gaps, key=lambda pair: pair[1].difference.value)
     largest, smallest = (
-        f"{gap.difference.value:+.2f} {format_interval(gap.difference.ci95)} ({cell.variant}; {cell.panel})"
+        f"{gap.difference.value:+.2f} {format_interval(gap.difference.ci95) if gap.difference.ci95 else ''}".rstrip()
+        + f" ({cell.variant}; {cell.panel})"
         for cell, gap in (ordered[-1], ordered[0])
     )
     return [told if number else _FEW, f"The largest difference is {largest}, the smallest {smallest}."]

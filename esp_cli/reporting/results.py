@@ -94,6 +94,7 @@ class CellResult(BaseModel):
     episodes: int | None = None  # per seed, where they are not those of all cells
     returns: dict[Mode, Numbers] = {}  # by mode, of the final evaluation, or of the evaluation at `at`
     anchors: dict[str, float] = {}  # mean returns of the reference policies
+    roles: tuple[str, ...] = ()  # of the agents, where they have some: a mean over unlike roles has no scale
     metrics: dict[str, float | None] = {}  # the task's measures of the greedy policy
     evaluations: int | None = None  # on the way
     # returns by seed at the evaluation nearest to a fifth of the run, in a study of broken symmetry or a benchmark
@@ -158,9 +159,10 @@ def summarise_cell(results: Results, cell: CellResult) -> CellSummary | None:
     good = values[np.isfinite(values)]
     if not good.size or returns.mean is None:
         return CellSummary(returns)
-    scores, ours = normalised(good, cell.anchors), (returns.mean, returns.sem, good.size)
+    scale = {} if cell.roles else cell.anchors
+    scores, ours = normalised(good, scale), (returns.mean, returns.sem, good.size)
     area = None if cell.area_under_curve is None else floats(cell.area_under_curve)
-    scaled = None if area is None or not kind_of(results.kind).benchmark else normalised(area, cell.anchors)
+    scaled = None if area is None or not kind_of(results.kind).benchmark else normalised(area, scale)
     return CellSummary(
         returns,
         iqm=interquartile_mean(good),

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import takewhile
+from itertools import takewhile, zip_longest
 from typing import TypeVar
 
 from pydantic import JsonValue
@@ -277,10 +277,11 @@ def _is_plain(config: Mapping[str, JsonValue]) -> bool:
 
 
 def _median_steps(cell: CellResult, mode: Mode, passing: Passing) -> tuple[float, Interval | None]:
-    """Return median and interval; not a number where a seed stopped before it got there: nobody knows when it had."""
-    ends = cell.returns.get(mode, ())
-    unknown = any(steps is end is None for steps, end in zip(passing.per_seed, ends, strict=False))
-    return (math.nan, None) if unknown else median_steps(passing.per_seed)
+    """Return median and interval, where they do not hang on when seeds that stopped would have got there."""
+    unknown = [steps is end is None for steps, end in zip(passing.per_seed, cell.returns.get(mode, ()), strict=False)]
+    early = [0 if left else steps for steps, left in zip_longest(passing.per_seed, unknown)]
+    soonest, latest = median_steps(early), median_steps(passing.per_seed)
+    return latest[0] if soonest[0] == latest[0] else math.nan, latest[1] if soonest == latest else None
 
 
 def _share(steps: float, of: float) -> str:

@@ -173,7 +173,9 @@ def read_config_file(path: Path) -> ConfigFile:
     choices, settings = {}, {}
     known = {*SECTIONS, *SECTIONS.values(), *ALGORITHMS}
     if empty := next((name for name in table if table[name] == {} and name not in known and ":" not in name), None):
-        raise UserError(f"{path} has an empty section '{shortened(empty)}'{did_you_mean(empty, known)}; leave it out")
+        raise UserError(
+            f"{path} has an empty section '{shortened(empty)}'{did_you_mean(empty, known) or '; leave it out'}"
+        )
     for name, value in flat(table, dots=1):
         if name in CHOICES:
             choices[name] = value

@@ -236,7 +236,16 @@ def test_a_function_is_called_as_each_version_of_rsl_rl_calls_it(body, tmp_path)
     def passes_on(env, **words):
         return right(env, words.pop("obs"), **words)
 
-    for function in (of_groups, passes_on):
+    def of_words(**words):
+        return passes_on(**words)
+
+    alone = torch.nn.Linear(9, 9, bias=False)  # a module takes anything, and is given the actions
+    alone.weight.data = torch.tensor(map_of(numbers[ACTION], body.elements[0])).float()
+    both = torch.nn.Module()
+    both.forward = lambda actions: torch.cat([actions, alone(actions)])
+    (_, copy) = audit(both, body, numbers)
+    assert (copy.element, copy.wrong) == ("flip-x", ())
+    for function in (of_groups, passes_on, of_words):
         assert [(copy.element, copy.wrong) for copy in audit(function, body, numbers)] == [
             ("identity", ()),
             ("flip-x", ()),
