@@ -167,6 +167,11 @@ class Body:
                 return name
         return ",".join(element.name for element in self.elements) or "c1"
 
+    @property
+    def not_covered(self) -> dict[str, str]:
+        """Those of `refused` that may hold, since nobody looked, or nothing would have shown."""
+        return {name: reason for name, reason in self.refused.items() if reason.startswith("not covered")}
+
     def rows(self, element: str) -> list[tuple[str, str, int, float, float, Difference]]:
         """Return of each joint of a model, for one of `found`: name, image, sign, gap, planted gap, difference.
 

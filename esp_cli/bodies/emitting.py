@@ -72,7 +72,7 @@ def mirror_of(body: Body, numbers: Numbers, group: str | None = None) -> ModuleT
 def _data(body: Body, numbers: Numbers, model: str, elements: Sequence[PlaneElement]) -> dict[str, object]:
     """Return the values of what `written` leaves open."""
     if not elements:
-        late = next((f"; {reason}" for reason in body.refused.values() if reason.startswith("not covered")), "")
+        late = next((f"; {reason}" for reason in body.not_covered.values()), "")
         raise UserError(f"{model} has no symmetry that was found, so there is no mirror to write{late}")
     moves = {
         name: {element.name: _move(map_of(layout, element)) for element in elements} for name, layout in numbers.items()

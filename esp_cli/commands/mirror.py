@@ -94,9 +94,8 @@ def _write(body: Body, model: Path, order: str | None, host: str, out: Path) -> 
     groups = "; ".join(f"{name}: {layout.summary}" for name, layout in layouts.items())
     console.say(f"{out} has {HOSTS[host]} for {', '.join(body.found)}; {groups}")
     console.note(f"{_proof_of(out)} proves it, with numpy alone")
-    for name, reason in body.refused.items():
-        if reason.startswith("not covered"):
-            console.note(f"it has no {name}, which is {reason}")
+    for name, reason in body.not_covered.items():
+        console.note(f"it has no {name}, which is {reason}")
     if order is None:
         console.note(
             "the numbers are those of Isaac Lab's velocity tasks, joints in the model's order; --order says yours"
@@ -188,8 +187,7 @@ def _print(body: Body, model: Path) -> None:
     rest = f"but for asymmetries of the model itself ({nearly})" if nearly else "exactly" if not blind else ""
     rest += f"{' and ' if nearly else ''}but for its sensors ({blind})" if blind else ""
     holds = f"is symmetric under {body.group}, {rest}; {len(body.joints)} joints"
-    late = any(reason.startswith("not covered") for reason in body.refused.values())
-    none = "has no mirror or turn that was found" if late else "has no mirror or turn that its accelerations show"
+    none = f"has no mirror or turn that {'was found' if body.not_covered else 'its accelerations show'}"
     console.say(f"{model.name} {holds if body.found else none}")
     for name, one in body.found.items():
         console.say(f"{called[name]}: {one.proof}")
@@ -206,7 +204,7 @@ def _print(body: Body, model: Path) -> None:
         if unseen := [joint for joint, _, _, _, planted, _ in body.rows(name) if not one.proof.would_show(planted)]:
             console.say(f"  not covered: a mistake at {', '.join(unseen)} would not show in accelerations")
     for name, reason in body.refused.items():
-        console.say(f"{called[name]} " + ("is " if reason.startswith("not covered") else "does not hold: ") + reason)
+        console.say(f"{called[name]} " + ("is " if name in body.not_covered else "does not hold: ") + reason)
     if not body.found:
         return
     shown = list(body.found)[:_SHOWN]

@@ -88,10 +88,15 @@ class CheckedTransform(Transform):
 
     lead: torch.Size
 
+    @property
+    def axes(self) -> tuple[int, ...]:
+        """The leading axes, and that of agents where there is one."""
+        return (*self.lead, *_agents(self.spaces))
+
     def action(self, action: Tensor) -> Tensor:
         """Return K_g a, of indices [..., N], [..., N, 1] or one-hot [..., N, A], or continuous actions."""
         check_tensor("action", action)
-        space, axes, shape = self.spaces.action, (*self.lead, *_agents(self.spaces)), list(action.shape)
+        space, axes, shape = self.spaces.action, self.axes, list(action.shape)
         if not isinstance(space, Discrete):
             if action.shape != (*axes, space.width):
                 raise UserError(f"the action has shape {shape}, but {[*axes, space.width]} is needed")
@@ -123,8 +128,7 @@ class CheckedTransform(Transform):
         """Move what goes with its agent: a number as by `per_agent`, or an action mask."""
         check_tensor(name, x)
         space = self.spaces.action
-        masks = (*self.lead, *_agents(self.spaces), space.count) if isinstance(space, Discrete) else (1,)
-        if masks[-1] > 1 and x.shape == masks:
+        if isinstance(space, Discrete) and space.count > 1 and x.shape == (*self.axes, space.count):
             if x.dtype != torch.bool:
                 raise UserError(f"{name} is {x.dtype}, but an action mask is torch.bool; give mask.bool()")
             return self.push_outputs(x)
@@ -132,8 +136,7 @@ class CheckedTransform(Transform):
 
     def _carried(self, move: Callable[[Tensor], Tensor], x: Tensor, name: str) -> Tensor:
         check_tensor(name, x)
-        lead, tail = self.lead, x.shape[len(self.lead) :]
-        agents = (*lead, *_agents(self.spaces))
+        lead, agents, tail = self.lead, self.axes, x.shape[len(self.lead) :]
         if x.shape[: len(lead)] == lead and tail.numel() == 1:
             return x
         if x.shape in (agents, (*agents, 1)):
