@@ -174,12 +174,17 @@ def test_a_killed_or_interrupted_driver_leaves_no_job_and_the_same_command_goes_
     def begun() -> bool:
         return StudyFolder.is_one(out) and all(checkpointed(folder(), cell) for cell in folder().study.cells)
 
+    def nothing_runs() -> bool:
+        return not any(is_held(folder().run_path(cell) / "run.lock") for cell in folder().study.cells)
+
     def folder() -> StudyFolder:
         return StudyFolder.open(out)
 
     with started() as process:
         wait_for(begun)
         process.kill()
+    # until then the runs of the first driver may still write, and would be taken for those of the second
+    wait_for(nothing_runs)
     before = steps_here(folder())
     with started() as process:
         # any, not all: beside other work one run may end before the other has begun
@@ -188,7 +193,7 @@ def test_a_killed_or_interrupted_driver_leaves_no_job_and_the_same_command_goes_
         told = process.communicate()[1]
     assert process.returncode == 130, told
     assert f"--engine ray --address {cluster.address}" in told
-    assert not any(is_held(folder().run_path(cell) / "run.lock") for cell in folder().study.cells)
+    assert nothing_runs()
     with started() as process:
         told = process.communicate()[1]
     assert process.returncode == 0, told
