@@ -34,9 +34,7 @@ def ablate(
     choices: StudyChoices,
     methods: Annotated[
         list[str] | None,
-        Option(
-            "--methods", help="What is compared: of breaking 'plain,ESP,auto', of prior 'none,esp'; by default all."
-        ),
+        Option("--methods", help="What is compared, as 'plain,ESP' of breaking and prior; by default all."),
     ] = None,
     broken_by: Annotated[
         list[str] | None,

@@ -122,10 +122,11 @@ def _pairs(
     teams = kind.teams or (Team(task, {}, ("table1", task)),)
     for team, steps, algorithm in product(teams, _steps(kind, task, request), algorithms):
         stem = f"{file_name(team.label)}-{format_exactly(steps)}-{file_name(algorithm)}"
-        for prior in variants:
-            config = _config(kind, task, algorithm, steps, request, {**team.settings, **kind.variants[prior]})
+        for variant in variants:
+            config = _config(kind, task, algorithm, steps, request, {**team.settings, **kind.variants[variant]})
+            prior = config.prior.kind
             yield Cell(
-                name=f"{stem}-{'plain' if prior == 'none' else prior}",
+                name=f"{stem}-{file_name(variant)}",
                 panel=f"{team.label}, {format_exactly(steps)}",
                 variant=_paired_name(algorithm, prior),
                 config=config,

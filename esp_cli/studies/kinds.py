@@ -15,7 +15,7 @@ GROUP = "<group>"  # stands for the group that the user chooses
 ALGORITHMS = ("maddpg", "qmix", "mappo")  # in the order of the paper's table
 PAPER_PRIOR: Settings = {"prior.transforms": "rot90", "prior.consistency_coef": 0.5}
 """What the ablations vary one thing of: a quarter turn and c = 0.5, as in the paper."""
-PLAIN_AND_ESP: Mapping[str, Settings] = {"none": {"prior.kind": "none"}, "esp": {"prior.kind": "esp"}}
+PLAIN_AND_ESP: Mapping[str, Settings] = {"plain": {"prior.kind": "none"}, "ESP": {"prior.kind": "esp"}}
 Breakings = Mapping[str, Mapping[str, tuple[float, ...]]]
 BREAKINGS: Breakings = {
     "navigation": {"action_turn_rad": (0.5, 1.57), "reward_offset": (0.1, 0.3), "mud": (0.5, 0.9), "wind": (0.3, 0.6)},
