@@ -39,9 +39,9 @@ def paper_cells(name: str) -> Iterator[tuple[str, str, tuple[str, ...]]]:
         for team in teams or (Team(task, {}, ("table1", task)),):
             for steps in paper.horizons(task):
                 for algorithm in kind.algorithms:
-                    for prior in kind.variants:
-                        key = (*team.place, str(steps), algorithm, prior)
-                        variant = algorithm.upper() + ("" if prior == "none" else "-ESP")
+                    for settings in kind.variants.values():
+                        key = (*team.place, str(steps), algorithm, str(settings["prior.kind"]))
+                        variant = algorithm.upper() + ("" if key[-1] == "none" else "-ESP")
                         yield f"{team.label}, {format_exactly(steps)}", variant, key
 
 
