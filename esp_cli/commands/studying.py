@@ -109,7 +109,7 @@ def search_or_forecast(search: Search, kind: str, choices: StudyChoices) -> None
 
     out, planned, fresh = choices.folder(kind), search.trials, None
     note_without_effect(search.without_effect())
-    trials, _ = Trials.planned(out, planned)
+    trials, _ = Trials.planned(out, planned, search.keeps)
     study = search.forecast(trials)
     StudyFolder.planned(out / FRESH, study, search.keeps)  # refuses folders before anything is trained
     if choices.dry_run:
@@ -118,7 +118,7 @@ def search_or_forecast(search: Search, kind: str, choices: StudyChoices) -> None
         forecast(StudyFolder(out / FRESH, study), choices, trials, groups, what)
         return
     with working(choices, out, search.request.device) as resources:
-        trials = Trials.create(out, planned)
+        trials = Trials.create(out, planned, search.keeps)
         failed = follow(trials, trials.cells_of(planned), resources)
         if not (resources.requests or failed):
             study = search.judged(trials)

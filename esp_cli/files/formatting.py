@@ -33,6 +33,11 @@ def format_mean(mean: float | None, sem: float | None = None) -> str:
     return f"{mean:.2f} ± {sem:.2f}" if sem is not None and math.isfinite(sem) else f"{mean:.2f}"
 
 
+def format_p(p: float | None) -> str:
+    """Return what to write of a p-value: "= 0.012", "< 0.001", or "-"."""
+    return NOTHING if p is None else f"= {p:.3f}" if p >= 0.001 else "< 0.001"
+
+
 def format_interval(interval: Sequence[float] | None) -> str:
     """Return an interval (low, high) as "[low, high]", and a dash for none."""
     if interval is None:

@@ -20,7 +20,7 @@ from jinja2 import Environment, FileSystemLoader, Template
 from esp_cli.defaults import __version__
 from esp_cli.drawing.draw import Request, draw
 from esp_cli.files.documents import encode
-from esp_cli.files.formatting import escaped, format_count, format_interval, format_mean
+from esp_cli.files.formatting import escaped, format_count, format_interval, format_mean, format_p
 from esp_cli.files.opening import read_regular
 from esp_cli.files.writing import replace_file
 from esp_cli.policies.loading import TrainedPolicy
@@ -217,7 +217,7 @@ def _verdict(cell: CellResult, other: CellResult) -> str:
         if gap.over_all_pairs is not None:
             return f"{differ} with every seed."
         return f"{differ}{f', {interval}' if gap.difference.ci95 else ''}. {_FEW}"
-    by = interval if gap.holm is None else f"p = {gap.holm:.3f} by the rank-sum test"
+    by = interval if gap.holm is None else f"p {format_p(gap.holm)} by the rank-sum test"
     return (
         f"{cell.variant} {_VERDICTS[gap.ahead]} {other.variant}: the difference is {gap.difference.value:+.2f}, {by}."
     )
@@ -225,13 +225,13 @@ def _verdict(cell: CellResult, other: CellResult) -> str:
 
 def _too_few(pairs: Sequence[tuple[CellResult, CellResult]]) -> list[str]:
     """Say where the seeds are so few that the rank-sum test tells nothing apart, however large a difference is."""
-    tested = [cell for cell, _ in pairs if cell.summary and cell.summary.gap and cell.summary.gap.holm is not None]
+    tested = [pair for pair in pairs if (summary := pair[0].summary) and summary.gap and summary.gap.holm is not None]
     few = dict[tuple[int, int], list[str]]()  # panels by the seeds that they have and need
-    for panel, comparisons in Counter(cell.panel for cell in tested).items():
-        seeds = min(len(cell.seeds) for cell in tested if cell.panel == panel)
+    for panel, comparisons in Counter(cell.panel for cell, _ in tested).items():
+        sizes = [[len(one.seeds) for one in pair] for pair in tested if pair[0].panel == panel]
         enough = next(n for n in itertools.count() if comparisons * 2 / math.comb(2 * n, n) <= 1 - CONFIDENCE)
-        if seeds < enough:
-            few.setdefault((seeds, enough), []).append(panel)
+        if all(comparisons * 2 / math.comb(sum(both), both[0]) > 1 - CONFIDENCE for both in sizes):
+            few.setdefault((min(map(min, sizes)), enough), []).append(panel)
     return [
         f"With {seeds} seeds the rank-sum test can tell nothing apart on {'; '.join(panels)}; take {enough} or more."
         for (seeds, enough), panels in few.items()

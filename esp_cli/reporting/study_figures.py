@@ -82,7 +82,7 @@ def draw_variants(results: Results, out: Path, style: Style = "screen") -> list[
     pictures = []
     for k, (panel, cells) in enumerate(_finished(results).items(), 1):
         groups = {variant: floats(cell.returns[results.mode]) for variant, cell in cells.items()}
-        anchors = {key: round(value, 1) for key, value in next(iter(cells.values())).anchors.items()}
+        anchors = next(iter(cells.values())).anchors
         pictures.append(dots(groups, out / f"returns-{k}", panel, f"{results.mode} return", anchors, style))
     return pictures
 

@@ -12,7 +12,15 @@ from typing import TypeVar
 from pydantic import JsonValue
 
 from esp_cli.defaults import Mode
-from esp_cli.files.formatting import NOTHING, format_count, format_duration, format_interval, format_mean, format_span
+from esp_cli.files.formatting import (
+    NOTHING,
+    format_count,
+    format_duration,
+    format_interval,
+    format_mean,
+    format_p,
+    format_span,
+)
 from esp_cli.policies.statistics import Estimate, Interval, Passing, SeedSummary, median_steps, summarise
 from esp_cli.reporting.results import CellResult, CellSummary, Gap, Results, floats
 from esp_cli.studies.kinds import kind_of
@@ -88,10 +96,10 @@ def returns_table(results: Results) -> Table:
 
 def _told_once(conventions: Sequence[str]) -> str:
     """Return conventions one after the other, with what all begin with said once: "esp: sum; mud 0.9; wind 0.3"."""
-    parts = [re.findall(r".+?(?:[:,] |$)", convention) for convention in conventions]
-    shared = "".join(each[0] for each in takewhile(lambda each: len(set(each)) == 1, zip(*parts, strict=False)))
-    rests = [convention.removeprefix(shared) for convention in conventions]
-    return re.sub(", $", "; ", shared) + "; ".join(rests) if all(rests) else "; ".join(conventions)
+    parts = [re.findall(r".+?[:,] ", f"{convention}, ") for convention in conventions]
+    shared = [each[0] for each in takewhile(lambda each: len(set(each)) == 1, zip(*parts, strict=False))]
+    texts = ["".join(shared), *("".join(own[len(shared) :]) for own in parts)]
+    return "; ".join(text.removesuffix(", ") for text in texts if text).replace(": ; ", ": ")
 
 
 def comparison_table(results: Results) -> Table:
@@ -109,7 +117,7 @@ def comparison_table(results: Results) -> Table:
     }
     corrected = kind_of(results.kind).benchmark
     if corrected:
-        columns["p, corrected>"] = _beside(lambda gap: NOTHING if gap.holm is None else f"{gap.holm:.3f}")
+        columns["p, corrected>"] = _beside(lambda gap: format_p(gap.holm).removeprefix("= "))
     columns["ahead of reference"] = _beside(lambda gap: AHEAD[gap.ahead])
     if has_paper:
         columns |= {
@@ -197,13 +205,14 @@ def provenance_table(results: Results) -> Table:
     # each run once: a report may look at several of its steps, and it may not have reached the last of them
     ordered = sorted(results.cells, key=lambda cell: cell.status == "finished")
     runs = {(cell.variant, str(cell.config)): cell for cell in ordered}.values()
-    total = sum(run.seconds or 0.0 for run in runs)
+    trained = {(str(run.config), run.seconds) for run in runs}  # runs that train the same were trained once, and copied
+    total = sum(seconds or 0.0 for _, seconds in trained)
     trained_by = {run.esp_version for run in runs if run.seconds is not None and run.esp_version}
     rows = (
         ("command", "; ".join(results.command.splitlines())),
         ("version of esp", ", ".join(sorted(trained_by) or [results.esp_version])),
         ("runs finished", f"{sum(run.status == 'finished' for run in runs)} of {len(runs)}"),
-        ("training", f"{format_duration(total)}, all runs added up"),
+        ("training", f"{format_duration(total)}, all runs added up, those that train the same once"),
     )
     return Table("Provenance", ("", ""), rows)
 
@@ -272,7 +281,8 @@ def _reference(results: Results) -> str:
 
 def _is_plain(config: Mapping[str, JsonValue]) -> bool:
     """Return whether a run, by its settings with dotted names, has no symmetry in its prior or its network."""
-    symmetric = config.get("network.name") in ("equivariant", "empn") or config.get("network.symmetrise")
+    known = "equivariant", "set-equivariant", "empn"
+    symmetric = config.get("network.name") in known or config.get("network.symmetrise")
     return config.get("prior.kind") == "none" and not symmetric
 
 

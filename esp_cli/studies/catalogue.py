@@ -43,15 +43,22 @@ class Request:
 def plan(name: str, request: Request) -> Study:
     """Plan a study of a kind, by its name in `KINDS`."""
     kind = KINDS[name]
-    cells = planned_cells(_cells(kind, request))
+    cells = planned_cells(_cells(kind, request), request)
     return Study(
         kind=name, title=kind.title, command=request.command, episodes=request.episodes, rows=kind.rows, cells=cells
     )
 
 
-def planned_cells(cells: Iterable[Cell]) -> tuple[Cell, ...]:
+def planned_cells(cells: Iterable[Cell], request: Request) -> tuple[Cell, ...]:
     """Return what is run where these cells are asked for."""
-    return tuple(cell.model_copy(update={"config": planned(cell.config)}) for cell in cells)
+
+    def given(config: RunConfig) -> dict[str, object]:
+        own = {k: v for k, v in request.overrides.items() if concerns(k, config.task, config.algorithm)}
+        return {"preset": request.preset, **own}
+
+    return tuple(
+        cell.model_copy(update={"config": planned(cell.config), "given": given(cell.config)}) for cell in cells
+    )
 
 
 def refuse_untrainable(study: Study) -> None:
@@ -227,6 +234,10 @@ def _refuse_unused(kind: StudyKind, request: Request, tasks: Sequence[str], algo
         raise UserError(f"--steps says nothing about {unserved[0]}; add a number of steps for all tasks, or for it")
     refuse_unknown_or_twice("task", tasks, tasks)
     refuse_unknown_or_twice("algorithm", algorithms, algorithms)
+    called = {_paired_name(algorithm, "none"): algorithm for algorithm in algorithms}
+    for algorithm in algorithms:
+        if (other := called[name := _paired_name(algorithm, "none")]) != algorithm:
+            raise UserError(f"tables would call both {algorithm} and {other} {name}; rename yours, or run one alone")
 
 
 def _paired_name(algorithm: str, prior: str) -> str:

@@ -53,16 +53,23 @@ class Trials(StudyFolder):
 
     @classmethod
     def planned(cls, path: Path, study: Study, keep: bool = True) -> tuple[Self, bool]:
-        """Return what `create` makes of the folder; what is judged already gets no further trials."""
+        """Return what `create` makes of the folder; what is judged there keeps its trials.
+
+        Where those that judge are kept, all of a panel have equally many trials; else a search may grow alone.
+        """
         if StudyFolder.is_one(path / FRESH) and cls.is_one(path):
-            known = {cell.name for cell in cls.open(path).study.cells}
-            done = {cell.name for cell in StudyFolder.open(path / FRESH).study.cells}
-            for cell in study.cells:
-                if cell.name not in known and (judged := cell.name.rpartition("-")[0]) in done:
+            there, judged = cls.open(path).study.cells, StudyFolder.open(path / FRESH)
+            done = {cell.name for cell in judged.study.cells}
+            for panel in dict.fromkeys(cell.panel for cell in study.cells):
+                asked, old = (_draws(cells, panel) for cells in (study.cells, there))
+                budget = min((len(own) for name, own in old.items() if not keep or name in done), default=0)
+                grown = all(own <= asked.get(name, set()) for name, own in old.items())
+                if budget and not (all(len(own) == budget for own in asked.values()) if keep else grown):
                     raise UserError(
-                        f"{path / FRESH} has judged {judged} already; keep its --budget, or choose another --out"
+                        f"{judged.path} has judged trials on {panel}, {budget} each; keep its --budget"
+                        f"{'' if keep else ' or more, and all its kinds of --prior'}, or choose another --out"
                     )
-        return super().planned(path, study, keep)
+        return super().planned(path, study)
 
 
 class Scores(BaseModel):
@@ -70,7 +77,7 @@ class Scores(BaseModel):
 
     draws: tuple[dict[str, JsonValue], ...]  # settings that were tried
     seeds: tuple[int, ...]  # of each trial
-    scores: dict[str, list[float | None]]  # by "TASK: CANDIDATE" of its trials; None where a seed stopped
+    scores: dict[str, list[float | None]]  # by "PANEL: CANDIDATE" of its trials; None where a seed stopped
 
 
 class Search(ABC):
@@ -117,7 +124,9 @@ class Search(ABC):
     def trials_of(self) -> dict[Candidate, list[Cell]]:
         """The trials of each candidate, one for each draw."""
         draws = range(len(self.draws))
-        return {one: list(planned_cells(self.trial(one, draw) for draw in draws)) for one in self.candidates}
+        return {
+            one: list(planned_cells((self.trial(one, draw) for draw in draws), self.request)) for one in self.candidates
+        }
 
     def without_effect(self) -> list[str]:
         """Return the settings that the user asked for and that change nothing in any trial."""
@@ -146,7 +155,7 @@ class Search(ABC):
     def record(self, path: Path, scores: Mapping[Candidate, Sequence[float]], best: Mapping[Candidate, int]) -> None:
         """Write the draws and all scores into the folder of the search, those of candidates of earlier calls too."""
         finite = {one: [value if math.isfinite(value) else None for value in own] for one, own in scores.items()}
-        named = {": ".join(one): own for one, own in finite.items()}
+        named = {f"{self.trials_of[one][0].panel}: {one[1]}": own for one, own in finite.items()}
         found, file = Scores(draws=tuple(map(dict, self.draws)), seeds=self.trial_seeds, scores=named), path / _SCORES
         with contextlib.suppress(OSError, UserError):
             known = validate(Scores, parse_object(read_regular(file, MAX_DOCUMENT_BYTES) or b"", "text"))
@@ -159,7 +168,17 @@ class Search(ABC):
         if not best:
             raise UserError(f"a seed stopped in every trial in {trials.path}, so there is nothing to judge")
         failed = {": ".join(one): "a seed stopped in each of its trials" for one in self.candidates if one not in best}
-        return self._study(*self.judges, planned_cells(self.fresh(best)), {**self.left_out, **failed})
+        return self._study(*self.judges, planned_cells(self.fresh(best), self.request), {**self.left_out, **failed})
+
+
+def _draws(cells: Iterable[Cell], panel: str) -> dict[str, set[str]]:
+    """Return the numbers of the trials of a panel by whose they are."""
+    found = dict[str, set[str]]()
+    for cell in cells:
+        name, _, draw = cell.name.rpartition("-")
+        if cell.panel == panel:
+            found.setdefault(name, set()).add(draw)
+    return found
 
 
 def _scores(trials: Trials, cells: Mapping[Candidate, Sequence[Cell]]) -> dict[Candidate, list[float]]:

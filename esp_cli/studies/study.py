@@ -12,6 +12,7 @@ Layout::
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import re
 import shutil
@@ -115,7 +116,7 @@ class StudyFolder:
         there = cls.open(path).study
         known = {cell.name: cell for cell in there.cells}
         again = [(cell, known[cell.name]) for cell in study.cells if cell.name in known]
-        told = {"reference", "paper"}  # what runs are compared with
+        told = {"reference", "paper", "given"}  # what runs are compared with, and whether they may be
         changed = [new.name for new, old in again if new != old.model_copy(update=new.model_dump(include=told))]
         if there.kind != study.kind or there.episodes != study.episodes or changed:
             which = f" ({changed[0]} has other seeds or settings)" if changed else ""
@@ -134,6 +135,9 @@ class StudyFolder:
             for cell in there.cells
             if keep and cell.name not in wanted
         )
+        for new, old in itertools.product(study.cells, rest):
+            if (new.panel, new.config.algorithm) == (old.panel, old.config.algorithm):
+                cls._refuse_unlike(path, new, old)
         cells = study.cells + rest
         found = {f"{cell.panel.partition(', ')[0]}: {cell.variant}" for cell in cells}
         earlier = {name: why for name, why in there.left_out.items() if keep and name not in found}
@@ -154,6 +158,18 @@ class StudyFolder:
         if not study.cells:
             raise UserError(f"{path / STUDY} is damaged: it names no run; plan the study again under another --out")
         return cls(path, study.model_copy(update={"cells": tuple(map(_completed, study.cells))}))
+
+    @staticmethod
+    def _refuse_unlike(path: Path, new: Cell, old: Cell) -> None:
+        """Refuse a run beside one for which the user gave other settings, since a table compares the two."""
+        if new.given is None or old.given is None or new.given == old.given:
+            return
+        name = next(name for name in {**old.given, **new.given} if old.given.get(name) != new.given.get(name))
+        how = f"with {name} {old.given[name]}" if name in old.given else f"without {name}"
+        raise UserError(
+            f"{old.name} in {path} was planned {how}, and its table would compare it with "
+            f"{new.name}; give both the same --set and --preset, or choose another --out"
+        )
 
     def _refuse_old_rules(self, cell: Cell) -> None:
         """Refuse a finished run of an earlier version of its task, which other runs are not to stand beside."""

@@ -78,7 +78,7 @@ def test_a_search_goes_from_a_command_to_a_preset_and_a_study_on_fresh_seeds(com
     assert "2 runs, 2 of them finished" in again.stderr
     assert f"report what judges them by: esp report {out / 'fresh'}" in refused("report", out)
     grown = json.loads(esp(*words, "--budget", 3, "--json", "-").stdout)
-    assert len(json.loads((out / "trials.json").read_text())["scores"]["navigation: ESP"]) == 3
+    assert len(json.loads((out / "trials.json").read_text())["scores"]["navigation, 200: ESP"]) == 3
     assert grown["cells"][0]["variant"] == "ESP, default"
     esp("report", out / "fresh")
     assert (out / "fresh" / "report" / "report.html").is_file()

@@ -4,6 +4,9 @@ import math
 
 import numpy as np
 import pytest
+import scipy.stats
+from hypothesis import given
+from hypothesis import strategies as st
 
 from esp_cli.policies.statistics import (
     MOST_RESAMPLED,
@@ -120,6 +123,20 @@ def test_the_rank_sum_test_by_hand():
     # ties, as of successes of 0 or 1: still 2 of 20; of 70, the three ways below and their mirrors are as far apart
     assert rank_sum_p([1.0] * 3, [0.0] * 3) == pytest.approx(2 / 20)
     assert rank_sum_p([1.0, 1.0, 2.0, 2.0], [2.0, 3.0, 3.0, 3.0]) == pytest.approx(6 / 70)
+    # ten seeds a side, all apart; with the two in the middle tied as well
+    apart = [*range(10)], [*range(10, 20)]
+    assert rank_sum_p(*apart) == pytest.approx(2 / math.comb(20, 10))
+    assert rank_sum_p(apart[0], [9, *apart[1][1:]]) == pytest.approx(2 * 2 / math.comb(20, 10))
+
+
+@given(st.lists(st.integers(-99, 99), min_size=2, max_size=24, unique=True), st.data())
+def test_without_ties_the_rank_sum_test_is_that_of_scipy(values, data):
+    count = data.draw(st.integers(1, len(values) - 1))
+    x, y = values[:count], values[count:]
+    exact = scipy.stats.mannwhitneyu(x, y, method="exact").pvalue
+    assert rank_sum_p(x, y) == pytest.approx(exact) == rank_sum_p(y, x)
+    large = np.arange(60.0), np.arange(60.0) + 20.5
+    assert rank_sum_p(*large) == scipy.stats.mannwhitneyu(*large).pvalue
 
 
 def test_steps_to_threshold_by_hand():

@@ -210,7 +210,8 @@ def test_the_picture_shows_the_curves(tmp_path):
 def test_what_all_conventions_begin_with_is_said_once():
     assert _told_once(["esp: sum, mud 0.9", "esp: sum, wind 0.3"]) == "esp: sum; mud 0.9; wind 0.3"
     assert _told_once(["esp: sum, mud 0.9", "esp: mean"]) == "esp: sum, mud 0.9; mean"
-    for unlike in (["sum, mud 0.9"], ["sum", "sum, mud 0.9"], ["sum, mud 0.9", "mean, mud 0.9"]):
+    assert _told_once(["esp: sum", "esp: sum, mud 0.9", "esp: sum, wind 0.3"]) == "esp: sum; mud 0.9; wind 0.3"
+    for unlike in (["sum, mud 0.9"], ["sum", "mean, mud 0.9"], ["sum, mud 0.9", "mean, mud 0.9"]):
         assert _told_once(unlike) == "; ".join(unlike)
 
 

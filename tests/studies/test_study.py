@@ -12,10 +12,12 @@ from esp_cli.reporting.collect import collect_study
 from esp_cli.reporting.page import answer
 from esp_cli.reporting.tables import TABLES
 from esp_cli.studies.engine import LocalEngine
+from esp_cli.studies.plan import STUDY_FORMAT
 from esp_cli.studies.study import StudyFolder, read_evaluation
 from esp_cli.training.folder_names import FINAL, LOG
 from esp_envs.errors import UserError
 from tests.studies.small_studies import small_study, write_run, write_study
+from tests.training.runs import TINY
 
 ENDS = {"MAPPO": [-120.0, -121.0, -122.0]}
 
@@ -63,6 +65,26 @@ def test_a_study_that_keeps_no_others_holds_what_was_planned_last(tmp_path):
     study = small_study(tasks=("predator-prey",), command="esp b")
     assert StudyFolder.create(tmp_path / "s", study, keep=False).study == study
     assert StudyFolder.open(tmp_path / "s").study == study
+
+
+def test_a_run_is_refused_beside_one_for_which_other_settings_were_given(tmp_path):
+    def planned(**choice):
+        return StudyFolder.create(tmp_path / "s", small_study("ablate-prior", **choice))
+
+    planned(variants=("plain",), overrides=TINY | {"mappo.gamma": 0.5})
+    for overrides, told in ((TINY, "with mappo.gamma 0.5"), (TINY | {"mappo.gamma": 0.6}, "with mappo.gamma 0.5")):
+        with pytest.raises(UserError, match=f"mappo-plain in .* was planned {told}, and its table would compare"):
+            planned(variants=("ESP",), overrides=overrides)
+    with pytest.raises(UserError, match=r"was planned without mappo\.gae_lambda"):
+        planned(variants=("ESP",), overrides=TINY | {"mappo.gamma": 0.5, "mappo.gae_lambda": 0.5})
+    folder = planned(tasks=("predator-prey",), overrides=TINY)
+    assert len(folder.study.cells) == 3, "whose table compares them with no run of navigation"
+    unknown = [cell.model_copy(update={"given": None}) for cell in folder.study.cells]
+    STUDY_FORMAT.write(
+        folder.path / "study.json",
+        {**folder.study.model_dump(mode="json"), "cells": [c.model_dump(mode="json") for c in unknown]},
+    )
+    assert len(planned(variants=("ESP",), overrides=TINY).study.cells) == 4, "planned by an earlier version"
 
 
 @pytest.mark.parametrize(

@@ -112,8 +112,8 @@ def test_the_best_trial_is_judged_and_the_first_of_equal_ones(tmp_path: Path) ->
     assert plain.config == asked.config("navigation", "plain", 2, trial=False)
     assert esp.config == asked.config("navigation", "ESP", 1, trial=False)
     assert json.loads((tmp_path / "s" / "trials.json").read_text())["scores"] == {
-        "navigation: plain": [0.0, 0.0, 5.0],
-        "navigation: ESP": [-1.0, 0.0, 0.0],
+        "navigation, 60k: plain": [0.0, 0.0, 5.0],
+        "navigation, 60k: ESP": [-1.0, 0.0, 0.0],
     }
 
 
@@ -123,14 +123,14 @@ def test_scores_of_methods_that_were_tried_before_stay_on_file(tmp_path: Path) -
         asked.judged(write_trials(tmp_path / "s", asked, {}))
     found = json.loads((tmp_path / "s" / "trials.json").read_text())
     assert {name: len(own) for name, own in found["scores"].items()} == {
-        "navigation: plain": 2,
-        "navigation: ESP": 2,
-        "navigation: copies": 3,
+        "navigation, 60k: plain": 2,
+        "navigation, 60k: ESP": 2,
+        "navigation, 60k: copies": 3,
     }
     assert len(found["draws"]) == 3
     (tmp_path / "s" / "trials.json").write_text('{"draws": 7, "scores": []}')
     asked.judged(Trials.open(tmp_path / "s"))
-    assert json.loads((tmp_path / "s" / "trials.json").read_text())["scores"].keys() == {"navigation: copies"}
+    assert json.loads((tmp_path / "s" / "trials.json").read_text())["scores"].keys() == {"navigation, 60k: copies"}
 
 
 def test_why_a_method_is_left_out_is_on_file_until_it_is_judged(tmp_path: Path) -> None:
@@ -168,8 +168,10 @@ def test_what_is_judged_gets_no_further_trials_but_other_methods_do(tmp_path: Pa
     judged = asked.judged(write_trials(tmp_path / "s", asked, {}))
     Trials.create(tmp_path / "s", benchmark(budget=4, variants=("plain",)).trials)
     StudyFolder.create(tmp_path / "s" / "fresh", judged)
-    with pytest.raises(UserError, match="has judged navigation-200k-esp already; keep its --budget"):
-        Trials.create(tmp_path / "s", benchmark(budget=4).trials)
+    judged_by_3 = "fresh has judged trials on navigation, 60k, 3 each; keep its --budget, or"
+    for more in ({"budget": 4}, {"budget": 2}, {"budget": 2, "variants": ("copies",)}):
+        with pytest.raises(UserError, match=judged_by_3):
+            Trials.create(tmp_path / "s", benchmark(**more).trials)
     assert len(Trials.create(tmp_path / "s", benchmark(variants=("copies",)).trials).study.cells) == 6 + 1 + 3
 
 
@@ -241,6 +243,12 @@ def test_only_panels_with_too_few_seeds_for_their_comparisons_are_named(tmp_path
     *_, few = answer(collect_study(folder))
     assert few == "With 4 seeds the rank-sum test can tell nothing apart on navigation, 200k; take 5 or more."
     assert "better than plain: ESP" in answer(collect_study(folder))[1]
+    material = collect_study(folder)
+    plain, *others = material.results.cells
+    of_ten = {"seeds": tuple(range(10)), "returns": {"greedy": tuple(-180.0 + k / 10 for k in range(10))}}
+    cells = (plain.model_copy(update=of_ten), *others)
+    several = replace(material, results=summarised(material.results.model_copy(update={"cells": cells})))
+    assert not any("can tell nothing" in text for text in answer(several)), "4 beside 10 seeds can"
 
 
 def test_another_learner_has_its_own_space_and_trials_as_long_as_what_judges() -> None:

@@ -10,6 +10,7 @@ from esp_cli.algorithms.presets import ALGORITHMS
 from esp_cli.studies.catalogue import Request
 from esp_cli.studies.search import Trials
 from esp_cli.studies.space import Dimension, default_space, drawn, read_space
+from esp_cli.studies.study import StudyFolder
 from esp_cli.studies.tuning import Tuning
 from esp_envs.errors import UserError
 from tests.studies.test_symmetry import benchmark, write_trials
@@ -213,7 +214,10 @@ def test_the_best_settings_are_written_for_training_and_all_scores_are_on_file(t
     }  # fmt: skip
     assert written["esp"] == written["none"] | {"prior.kind": "esp"} | asked.draws[3]
     trials = json.loads((tmp_path / "s" / "trials.json").read_text())
-    assert trials["scores"] == {"navigation: ESP": [0.0, 0.0, 0.0, 5.0], "navigation: plain": [5.0, 0.0, 0.0, 0.0]}
+    assert trials["scores"] == {
+        "navigation, 900: ESP": [0.0, 0.0, 0.0, 5.0],
+        "navigation, 900: plain": [5.0, 0.0, 0.0, 0.0],
+    }
     assert (trials["draws"], trials["seeds"]) == (asked.draws, [100, 101])
 
 
@@ -248,6 +252,14 @@ def test_a_longer_search_goes_on_in_its_folder_and_one_in_another_space_does_not
     assert len(Trials.create(tmp_path / "s", tuning(budget=5).trials).study.cells) == 10
     with pytest.raises(UserError, match="holds another study"):
         Trials.create(tmp_path / "s", benchmark().trials)
+    asked = tuning(budget=5)
+    StudyFolder.create(tmp_path / "s" / "fresh", asked.judged(write_trials(tmp_path / "s", asked, {})), keep=False)
+    assert len(Trials.planned(tmp_path / "s", tuning(budget=6).trials, keep=False)[0].study.cells) == 12
+    for fewer in ({"budget": 4}, {"budget": 5, "priors": ("esp",)}):
+        with pytest.raises(
+            UserError, match="5 each; keep its --budget or more, and all its kinds of --prior"
+        ):
+            Trials.planned(tmp_path / "s", tuning(**fewer).trials, keep=False)
     other = tuning(space={"mappo.gamma": Dimension(low=0.5, high=0.6)})
     with pytest.raises(UserError, match=r"holds another study .esp-001 has other seeds or settings"):
         Trials.create(tmp_path / "s", other.trials)
