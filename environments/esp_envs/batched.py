@@ -31,8 +31,8 @@ class BatchedTask(Environment):
     begins anew for itself. Its start is drawn in every step, so that no world's chance depends on when others end.
 
     Attributes:
-        world: what `_start` drew and `_advance` wrote. It may hold further tensors [S, E, ...] beside the fields of the
-            state, such as chance that is drawn in advance; they are saved too, and `set_state` leaves them alone.
+        world: what `_start` drew and `_advance` wrote. `_start` may draw further tensors beside the fields of the
+            state, such as chance for a whole episode; they are saved too, and `set_state` leaves them alone.
 
     Example:
         class Rendezvous(BatchedTask):
@@ -53,7 +53,6 @@ class BatchedTask(Environment):
         if not isinstance(self.spec, TaskSpec):
             raise UserError(f"'_describe' of {type(self).__name__} returns {self.spec!r}; return a TaskSpec")
         self.world: World = self._split(torch.zeros(self.state_shape, device=self.device))
-        self._further: tuple[str, ...] = ()  # names in the world that are no fields of the state
         self._time = 0  # since the last reset, modulo the horizon
         self._worlds_shape = (self.num_seeds, num_envs)
         self._agents_shape = (*self._worlds_shape, self.spec.num_agents)
@@ -173,7 +172,6 @@ class BatchedTask(Environment):
                     f"'{field.name}' of what '_start' of {self.spec.name} drew is {found.dtype}; give torch.float32"
                 )
         self.world = drawn
-        self._further = tuple(drawn.keys() - {field.name for field in self.spec.state.fields})
 
     def _next_episodes(self) -> World:
         """Return the tensors with which worlds begin anew that end in this step."""
@@ -188,7 +186,13 @@ class BatchedTask(Environment):
 
     def _play(self, action: Tensor) -> Outcome:
         """Advance every world; return reward [S, E, N] and metrics, as float32 memory of their own."""
+        known = {*self.world}
         outcome: object = self._advance(self.world, self.spec.admissible(action))
+        if added := self.world.keys() - known:
+            raise UserError(
+                f"'_advance' of {self.spec.name} adds '{min(added)}' to the world, which '_start' did not draw; let "
+                "'_start' draw its first value, with which episodes begin"
+            )
         if not isinstance(outcome, tuple) or len(outcome) != 2 or not isinstance(outcome[0], Tensor):
             raise UserError(
                 f"'_advance' of {self.spec.name} gives {type(outcome).__name__}; return a tensor of rewards and a dict "
@@ -256,14 +260,14 @@ class BatchedTask(Environment):
 
     def _to_save(self) -> dict[str, Tensor]:
         """Return the tensors that decide what follows, by the names under which they are saved."""
-        return {"world": self._state()} | {_FURTHER + name: self.world[name] for name in self._further}
+        fields = self.spec.state.slices()
+        further = {_FURTHER + name: value for name, value in self.world.items() if name not in fields}
+        return {"world": self._state()} | further
 
     def _take_back(self, saved: dict[str, Tensor]) -> None:
         """Take back the tensors of `_to_save`; their shapes are right."""
         self._put(saved["world"])
-        further = {name.removeprefix(_FURTHER): saved[name].clone() for name in saved if name.startswith(_FURTHER)}
-        self.world |= further
-        self._further = tuple(further)
+        self.world |= {n.removeprefix(_FURTHER): saved[n].clone() for n in saved if n.startswith(_FURTHER)}
 
     def _put(self, state: Tensor) -> None:
         """Write a global state [S, E, state width] into the worlds."""

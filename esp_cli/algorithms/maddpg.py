@@ -52,7 +52,8 @@ class MaddpgConfig(ExploringConfig):
     def without_effect(self, network: NetworkConfig, spec: Callable[[], TaskSpec]) -> frozenset[str]:
         own = spec()
         idle = frozenset() if isinstance(own.action, Discrete) else frozenset({"actor_gradient"})
-        joint = own.shared_reward and type(network).joint_critic is not NetworkConfig.joint_critic
+        shared = all(role.shared_reward for role, _ in own.parts)
+        joint = shared and type(network).joint_critic is not NetworkConfig.joint_critic
         return idle | {"critic_activation"} if joint else idle
 
 

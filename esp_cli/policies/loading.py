@@ -6,7 +6,7 @@ Loading never runs code. What is missing, foreign, damaged or of another version
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from shlex import quote
@@ -72,33 +72,41 @@ class TrainedPolicy:
         raise UserError(f"{path} holds no checkpoint yet; train on with esp train --resume {quote(str(path))}")
 
     def transfer(self, settings: Mapping[str, object]) -> TrainedPolicy:
-        """Return the policy for its task under changed settings, other numbers too where weights are free of counts."""
+        """Return the policy for its task under changed settings, other numbers too where each role's weights fit."""
         if not settings:
             return self
         changed = resolve_task_settings(self.config.task, {**self.config.task_settings, **settings})
         config = self.config.model_copy(update={"task_settings": changed})
-        spec = spec_of(config)
-        free = config.network.free_of_counts
-        seen = [one.observation.without_counts if free else one.observation for one in (spec, self.spec)]
-        numbers = spec.num_agents != self.spec.num_agents
+        spec, free = spec_of(config), config.network.free_of_counts
+        was, now = ([role for role, _ in one.parts] for one in (self.spec, spec))
+
+        def differ(what: Callable[[TaskSpec], object]) -> bool:
+            return [what(role) for role in was] != [what(role) for role in now]
+
+        numbers, rows = differ(lambda role: role.num_agents), differ(lambda role: role.observation)
+        seen = differ(lambda role: role.observation.without_counts) if free else rows
         differs = {
-            "agents": numbers and (seen[0] != seen[1] or self.policy.actor.team > 1),
-            "observation": seen[0] != seen[1],
-            "action": spec.action != self.spec.action,
-            "masks": spec.masks != self.spec.masks,
+            "roles": [role.name for role in spec.roles] != [role.name for role in self.spec.roles],
+            "agents": numbers and seen,
+            "observation": seen,
+            "action": differ(lambda role: role.action),
+            "masks": differ(lambda role: role.masks),
         }
+        names = ", ".join(f"task.{name}" for name in settings)
         if part := next((part for part, other in differs.items() if other), None):
-            names = ", ".join(f"task.{name}" for name in settings)
-            made = numbers and not free
-            known = "; the weights of its network are made for a number of agents, of set for any" if made else ""
+            hint = "change only what a policy neither sees nor does"
+            if part == "agents" and not free:
+                hint += "; the weights of its network are made for a number of agents, of set for any"
+            elif part in ("agents", "observation") and (lost := _seen_in_one(was, now)) and free:
+                hint = f"weights for {', '.join(lost)} are missing where none are seen, so keep one or more, or none"
             raise UserError(
-                f"{self.source} was trained with other {part} than the task has with {names} "
-                f"changed; change only what a policy neither sees nor does{known}"
+                f"{self.source} was trained with other {part} than the task has with {names} changed; {hint}"
             )
-        if spec.observation == self.spec.observation and not numbers:  # whatever the task declares of itself now
+        if not (numbers or rows):  # whatever the task declares of itself now
             return replace(self, config=config, spec=spec)
         policy = _untrained(config, spec)
-        policy.load_state_dict(self.policy.state_dict())
+        misfit = f"{self.source}: the weights do not fit the task with {names} changed"
+        _fill(policy, self.policy.state_dict(), self.source, misfit)
         return replace(self, config=config, spec=spec, policy=policy)
 
     def of_role(self, role: str | None) -> TrainedPolicy:
@@ -190,6 +198,12 @@ def weights_to_start(source: str | os.PathLike[str], learner: Learner) -> tuple[
             )
     weights = {name: t.cpu().expand(seeds, *t.shape[1:]).contiguous() for name, t in {**given, **fitting}.items()}
     return InitialPolicy(source=os.fspath(source), sha256=digest(weights, {})), weights
+
+
+def _seen_in_one(was: list[TaskSpec], now: list[TaskSpec]) -> list[str]:
+    """Return the families that a role sees in one of two specs alone."""
+    sets = [[{family.name for family in role.observation.families} for role in roles] for roles in (was, now)]
+    return sorted({name for one, other in zip(*sets, strict=True) for name in one ^ other})
 
 
 def _untrained(config: RunConfig, spec: TaskSpec) -> Policy:

@@ -292,6 +292,27 @@ def test_what_a_world_remembers_is_saved_and_left_alone_by_set_state() -> None:
     assert torch.equal(env.state_dict()["world"], saved["world"])
 
 
+def test_what_a_world_remembers_is_drawn_first() -> None:
+    class Remembers(Plain):
+        def _advance(self, world, action):
+            world["last"] = action
+            return super()._advance(world, action)
+
+    class Draws(Remembers):
+        def _start(self, generator):
+            return super()._start(generator) | {"last": torch.zeros(self.num_envs, 2, 3)}
+
+    env = worlds(Remembers)
+    env.reset()
+    with pytest.raises(ValueError, match="'_advance' of plain adds 'last' to the world, which '_start' did not draw"):
+        env.step(env.random_action())
+    env = worlds(Draws)
+    env.reset()
+    action = env.random_action()
+    env.step(action)
+    assert torch.equal(env.state_dict()["world.last"], env.spec.admissible(action))
+
+
 def test_others_are_seen_in_index_order() -> None:
     position = torch.tensor([[0.0], [1.0], [10.0]])
     assert to_others(position).squeeze(-1).tolist() == [[1.0, 10.0], [-1.0, 9.0], [-10.0, -9.0]]

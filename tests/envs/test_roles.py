@@ -75,6 +75,10 @@ def test_spaces_of_all_and_of_each_role():
     assert [where for _, where in spec.parts] == [slice(0, 2), slice(2, 3)]
 
 
+def test_a_setting_is_idle_where_it_is_in_every_role():
+    assert "maddpg.critic_activation" not in short("maddpg", **{"network.name": "set"}).without_effect(), "the prey's"
+
+
 def test_a_step_by_hand():
     env = worlds()
     placed(env)

@@ -8,9 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from esp_cli import load_policy
+from esp_cli import discrete_moves, load_policy
+from esp_cli.algorithms.presets import ALGORITHMS
+from esp_cli.algorithms.roles import new_policy
 from esp_cli.policies.loading import TrainedPolicy
-from esp_envs import UserError
+from esp_cli.training.build import generators
+from esp_cli.training.config import resolve_config
+from esp_envs import Field, Kind, UserError, layout
+from esp_envs.roles import Role, spec_with_roles
+from esp_envs.spec import TaskSpec
 from tests.cli.running import esp, refused, train_tiny
 
 SETS = ("--network", "set", "--set", "mappo.critic_input=state", "--set", "network.width=4")
@@ -96,4 +102,50 @@ def test_a_network_with_a_count_says_so(perceptron: Path, tmp_path: Path) -> Non
 
 def test_other_things_are_still_refused(three: Path) -> None:
     assert "with other action than" in refused("eval", three, "--set", "task.actions=continuous")
-    assert "with other agents than" in refused("eval", three, "--set", "task.num_agents=1")  # no others to see
+    assert refused("eval", three, "--set", "task.num_agents=1").endswith(
+        "was trained with other agents than the task has with task.num_agents changed; "
+        "weights for others are missing where none are seen, so keep one or more, or none"
+    )
+
+
+def two_roles(hunters: int, prey: int, seen: str = "position") -> TaskSpec:
+    own, moves = layout(Field(seen, Kind.VECTOR)), discrete_moves(4)
+    numbers = {"hunter": hunters, "prey": prey}
+    roles = [Role(name=name, num_agents=count, observation=own, action=moves) for name, count in numbers.items()]
+    return spec_with_roles(roles, name="two", version=1, convention="none", horizon=5, symmetry="c1")
+
+
+@pytest.fixture
+def opposed() -> TrainedPolicy:
+    """Hunters that always take the first action and prey that takes the third, of a task of two and one."""
+    config, spec = resolve_config("navigation", overrides={"network.name": "mlp"}), two_roles(2, 1)
+    policy = new_policy(ALGORITHMS["mappo"], spec, config.network, generators(config.seeds, "shape"))
+    for role, action in (("hunter", 0), ("prey", 2)):
+        weights = policy.of(role).actor.state_dict()
+        for tensor in weights.values():
+            tensor.zero_()
+        [*weights.values()][-1][..., action] = 1
+    return TrainedPolicy(config, policy, spec, 0, Path("run"))
+
+
+@pytest.mark.parametrize(("hunters", "prey"), [(2, 1), (1, 2), (3, 1), (2, 3)])
+def test_each_role_acts_for_its_own_agents(opposed: TrainedPolicy, monkeypatch, hunters: int, prey: int) -> None:
+    monkeypatch.setattr("esp_cli.policies.loading.spec_of", lambda _: two_roles(hunters, prey))
+    policy, rows = opposed.transfer({"horizon": 5}).policy, torch.zeros(1, 1, hunters + prey, 2)
+    action, _ = policy.act(rows, policy.initial_memory(1, rows))
+    assert action.flatten().tolist() == [0] * hunters + [2] * prey
+
+
+def test_a_role_that_sees_or_is_something_else_is_refused(opposed: TrainedPolicy, monkeypatch) -> None:
+    for spec, part in ((two_roles(2, 1, "velocity"), "observation"), (two_roles(2, 1).roles[0], "roles")):
+        monkeypatch.setattr("esp_cli.policies.loading.spec_of", lambda _, spec=spec: spec)
+        with pytest.raises(UserError, match=f"run was trained with other {part} than"):
+            opposed.transfer({"horizon": 5})
+
+
+def test_roles_over_sets_are_evaluated_with_other_numbers(tmp_path: Path) -> None:
+    both = ("--task", "predator-prey", "--set", "task.control=both", "--network", "set", "--set", "network.width=4")
+    run = train_tiny(tmp_path / "both", *both, steps=50)
+    result = json.loads(esp("eval", run, "--episodes", 2, "--set", "task.num_predators=5", "--json", "-").stdout)
+    assert result["task_settings"]["num_predators"] == 5
+    assert "weights for others are missing" in refused("eval", run, "--set", "task.num_predators=1")

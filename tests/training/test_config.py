@@ -87,6 +87,7 @@ def test_what_a_preset_sets_for_its_network_is_left_out_for_another_that_does_no
         ("formation", "maddpg", {}, {"maddpg.actor_gradient"}),
         ("formation", "maddpg", {"task.num_obstacles": 0}, {"maddpg.actor_gradient", "task.obstacle_radius_m"}),
         ("navigation", "maddpg", {}, {"maddpg.critic_activation", "task.local_ratio"}),
+        ("predator-prey", "maddpg", {"network.name": "set", "task.control": "both"}, {"maddpg.critic_activation"}),
         ("navigation", "qmix", {}, {"qmix.hyper_width", "task.local_ratio"}),
         ("predator-prey", "qmix", {"network.layer_norm": True}, {"network.precision", "network.compiled"}),
         (
