@@ -126,9 +126,8 @@ def draw_results() -> None:
         for panel in dict.fromkeys(cell.panel for cell in results.cells):
             cells = [cell for cell in results.cells if cell.panel == panel]
             groups = {cell.variant: floats(cell.returns[results.mode]) for cell in cells}
-            anchors = {key: round(value, 1) for key, value in cells[0].anchors.items()}
             learner = cells[0].name.split("-")[1]
-            drawn = dots(groups, MEASURED / f"{picture}-{learner}", panel, f"{results.mode} return", anchors)
+            drawn = dots(groups, MEASURED / f"{picture}-{learner}", panel, f"{results.mode} return", cells[0].anchors)
             drawn.with_suffix(".svg").unlink()  # the pages show PNGs
     for picture, names in TUNED.items():
         searches, task = [read_results(MEASURED / f"{name}.json") for name in names], picture.removeprefix("tuned-")
