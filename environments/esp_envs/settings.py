@@ -34,8 +34,9 @@ class TaskSettings(BaseModel):
         }
 
     def broken(self) -> dict[str, Breaks]:
-        """Return what those leave that are not 0, each with the name of a planar group."""
-        marks = {name: mark for name, mark in self.breakable().items() if getattr(self, name)}
+        """Return what those leave that are not 0 and have an effect, each with the name of a planar group."""
+        idle = self.without_effect()
+        marks = {name: mark for name, mark in self.breakable().items() if getattr(self, name) and name not in idle}
         return {name: replace(mark, plane=getattr(self, f"{mark.plane}", mark.plane)) for name, mark in marks.items()}
 
     def left_of(self, whole: str) -> str:

@@ -40,6 +40,9 @@ class WildlifeSettings(TaskSettings):
         0.0, ge=0, le=1, description="breaks symmetry: probability that a moving poacher is carried to the right"
     )
 
+    def without_effect(self) -> frozenset[str]:
+        return frozenset({"wind"} if self.poacher_moves == 0 else ())
+
     @model_validator(mode="after")
     def _fits(self) -> WildlifeSettings:
         if self.width % 2 == 0 or self.height % 2 == 0:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from esp_envs import BatchedTask, Environment, Field, Kind, Scene, generators_for, layout, make, to_others
+from esp_envs import BatchedTask, Body, Environment, Field, Kind, Scene, generators_for, layout, make, to_others
 from esp_envs.conformance import PROMISES, Broken, NotAsked, Subject, check
 from esp_envs.mpe.task import MOVES
 from esp_envs.spec import Continuous, TaskSpec, discrete_moves
@@ -370,12 +370,39 @@ def plain(**methods: object) -> type[Environment]:
     return type("_".join(methods), (Plain,), methods)
 
 
+class Matrix(Plain):
+    """A game of one state, in which every episode starts and ends."""
+
+    def _start(self, generator):
+        return {"position": torch.zeros(self.num_envs, 2, 2)}
+
+    def _advance(self, world, action):
+        return action.sum(-1), {}
+
+    def scene(self, world=(0, 0)):
+        return Scene((Body((0.0, 0.0), 0.1, "#000000"),) * 2, (-1, 1, -1, 1))
+
+
+def going_on(env: Plain):
+    """Return the world as it is, but for the first time."""
+    return env.world if env.world["position"].any() else Plain._episodes(env)
+
+
+def test_a_game_of_one_state_breaks_no_promise() -> None:
+    findings = check(Subject(lambda num_envs, seeds: worlds(Matrix, num_envs, seeds)))
+    assert [finding for finding in findings if finding.broken] == []
+
+
 BREAKERS = {
     "observations_rewards_and_metrics_fit_the_spec": [plain(_observe=lambda _, world: world["position"] / 0), Unequal],
     "actions_of_heuristics_and_chance_lie_in_the_action_space": [
         plain(heuristics=("far",), heuristic=lambda self, name=None: torch.full(self.action_shape, 3.0))
     ],
-    "episodes_end_when_the_spec_says": [EarlyClock, Endless, Ended],
+    "episodes_end_when_the_spec_says": [
+        *(EarlyClock, Endless, Ended),
+        plain(_episodes=going_on, _start=Matrix._start),  # begins alike, and ends elsewhere
+        plain(_episodes=going_on, _advance=Matrix._advance),  # each stands where it began
+    ],
     "the_same_seed_gives_the_same_run": [GlobalDice],
     "a_seed_alone_equals_itself_among_others": [
         plain(_episodes=lambda self: {"position": self.draw(2, 2) + torch.randn(1, generator=self.generators[0])})
@@ -395,7 +422,10 @@ BREAKERS = {
     ],
     "set_state_reproduces_what_follows": [plain(_put=lambda self, state: Plain._put(self, state * 2))],
     "set_state_starts_an_episode": [NoRestart],
-    "a_scene_can_be_drawn": [plain(scene=lambda self, world=(0, 0): Scene((), (0, 1, 0, world[0] + 1)))],
+    "a_scene_can_be_drawn": [
+        plain(scene=lambda self, world=(0, 0): Scene((), (0, 1, 0, world[0] + 1))),
+        plain(scene=Matrix.scene),
+    ],
 }
 BY_NAME = {promise.__name__: promise for promise in PROMISES}
 

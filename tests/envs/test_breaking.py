@@ -64,6 +64,9 @@ def test_what_several_breakings_leave() -> None:
         "those that are 0 break nothing"
     )
     assert settings.broken_in_words() == ", wind 1, action_turn_rad 0.5"
+    found = {moves: make("wildlife", 1, [0], {"wind": 0.5, "poacher_moves": moves}) for moves in (0.0, 0.5)}
+    assert [env.spec.symmetry for env in found.values()] == ["d4*agents", "flip-x*agents"]
+    assert [env.settings.without_effect() for env in found.values()] == [{"wind"}, set()], "a poacher at rest"
 
 
 def placed(task: str, positions: list[float], velocity: float = 0.0, **settings: object) -> Environment:

@@ -431,6 +431,47 @@ def test_agents_in_tuple_spaces_act_as_the_task_says() -> None:
     assert step.metrics["highest"].tolist() == [[2.0, 2.0]]
 
 
+class Slider:
+    """A point that goes as far as the first two numbers of a Box say, of whatever shape."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.action_space = gymnasium.spaces.Box(-2.0, 2.0, shape)
+
+    def reset(self, seed=None, options=None):
+        return np.zeros(2), {}
+
+    def step(self, action):
+        assert self.action_space.contains(action)
+        return action.flatten()[:2], 0.0, False, False, {}
+
+
+PUSH = Continuous(layout(Field("push", Kind.VECTOR)))
+TAKEN = [
+    (discrete_moves(4), (2,), lambda *given: np.float32([given[-1], 0]), 2, [2.0, 0.0]),
+    (PUSH, (4,), lambda *given: np.append(given[-1], np.float32([0, 0])), [0.5, -0.5], [0.5, -0.5]),
+    (PUSH, (2, 1), lambda *given: given[-1][:, None], [0.5, -0.5], [0.5, -0.5]),
+    (PUSH, (2,), lambda *given: given[-1], [0.5, -0.5], [1.0, -1.0]),  # it fits, and is stretched to its bounds
+]
+
+
+@pytest.mark.parametrize(("action", "shape", "acting", "given", "moved"), TAKEN)
+def test_a_box_of_another_shape_is_acted_in_by_the_hook_alone(action, shape, acting, given, moved) -> None:
+    class Sliding(SingleAgentTask):
+        observation, symmetry, convention = layout(Field("moved", Kind.VECTOR)), "d4", "slider"
+
+        def make_single(self):
+            return Slider(shape)
+
+    Sliding.action = action
+    if shape != (2,) or action is not PUSH:
+        with pytest.raises(ValueError, match="acts in Box"):
+            Sliding(Sliding.Settings(), 1, generators_for([0]))
+    Sliding.acting = acting
+    env = Sliding(Sliding.Settings(), 1, generators_for([0]))
+    env.reset()
+    assert env.step(torch.tensor(given).view(env.action_shape)).next.obs.flatten().tolist() == moved
+
+
 class Gripper:
     """It sees and acts in Dict spaces, sees a Tuple in one of them, and draws itself."""
 

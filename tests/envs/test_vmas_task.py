@@ -15,7 +15,8 @@ from esp_cli.training.config import resolve_config
 from esp_envs import Environment, Field, Items, Kind, UserError, generators_for, layout, make, register
 from esp_envs.adapters import seed_of
 from esp_envs.adapters.simulation import groups_of
-from esp_envs.conformance import Subject, check
+from esp_envs.conformance import Subject, check, set_state_reproduces_what_follows
+from esp_envs.promises import a_scene_can_be_drawn
 from esp_envs.views import OthersAtRandom, RoleView, worlds_of_role
 from tests.own_tasks import save_page_files
 
@@ -157,6 +158,37 @@ def test_chance_inside_a_step_belongs_to_the_seed() -> None:
     findings = {f.promise: f for f in check(subject)}
     assert [f for f in findings.values() if f.broken] == []
     assert findings["set state reproduces what follows"].not_asked == "the task has chance of its own"
+
+
+UNTOLD = {
+    "BallTrajectory": {"angles to the last digit"},
+    "BuzzWire": {"angles to the last digit"},
+    "Flocking": {"the clock"},
+    "JointPassage": {"angles to the last digit"},
+    "JointPassageSize": {"angles to the last digit", "which passage is big"},
+    "WindFlocking": {"what controllers remember"},
+    "MultiGiveWay": set(),  # all of it is in the state, and its worlds start alike
+}
+
+
+@pytest.mark.parametrize("name", UNTOLD)
+def test_a_scenario_says_what_its_state_leaves_out(name: str) -> None:
+    promises = (set_state_reproduces_what_follows, a_scene_can_be_drawn)
+    subject = Subject(lambda n, seeds: worlds(name, {"horizon": 7}, n, seeds), rounding=1e-3)
+    followed, drawn = check(subject, promises)
+    assert (followed.broken, drawn.broken) == (None, None)
+    assert set(worlds(name, {}).spec.hidden) == UNTOLD[name]
+    assert (followed.not_asked is None) == (not UNTOLD[name])
+
+
+def test_the_angle_of_a_goal_is_in_the_state_where_an_episode_draws_it() -> None:
+    env, other = (worlds("JointPassage", {}, 4, (seed,)) for seed in (0, 5))
+    start = env.reset()
+    assert not torch.allclose(start.obs, other.reset().obs)
+    torch.testing.assert_close(other.set_state(start.state).obs, start.obs)
+    slices, seen = env.spec.state.slices(), env.spec.observation.slices()["goal_direction"]
+    torch.testing.assert_close(start.state[..., slices["joint_goal.heading"]], start.obs[:, :, 0, seen])
+    assert "joint_goal.spin" not in slices
 
 
 def test_a_layout_of_another_width_is_refused() -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from esp_envs.errors import UserError
 from esp_envs.installed import last_line, raised_in
-from esp_envs.spec import Continuous, Kind
+from esp_envs.spec import ActionSpace, Continuous, Kind
 
 PARALLEL, SINGLE = "a PettingZoo ParallelEnv", "a Gymnasium environment"
 _AEC, _VECTOR = "a PettingZoo AEC environment, whose agents act in turn", "a vector of environments"
@@ -218,9 +218,11 @@ def require_round(action: Continuous, symmetry: str, name: Any, box: tuple[NDArr
             )
 
 
-def bounds_of(space: Any) -> tuple[NDArray[Any], NDArray[Any]] | None:
-    """Return the bounds of a finite Box of real numbers, None for any other space."""
-    if not hasattr(space, "low") or space.dtype.kind != "f":
+def bounds_of(space: Any, action: ActionSpace) -> tuple[NDArray[Any], NDArray[Any]] | None:
+    """Return the bounds of a finite Box of as many real numbers as the action has, None for any other space."""
+    if not isinstance(action, Continuous) or not hasattr(space, "low") or space.dtype.kind != "f":
+        return None
+    if space.shape != (action.width,):
         return None
     with np.errstate(over="ignore", invalid="ignore"):
         is_finite = np.isfinite(space.high - space.low).all()  # bounds of the largest numbers are none

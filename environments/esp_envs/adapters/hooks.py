@@ -13,7 +13,7 @@ from esp_envs.adapters import foreign
 from esp_envs.adapters.pairing import Array, Attributes, Simulator
 from esp_envs.errors import UserError
 from esp_envs.roles import Role, of_role
-from esp_envs.spec import ActionSpace, Discrete, Layout
+from esp_envs.spec import ActionSpace, Continuous, Discrete, Layout
 
 
 class CopyHooks(ABC):
@@ -108,9 +108,9 @@ class CopyHooks(ABC):
         return np.concatenate([np.ravel(part) for part in given]) if isinstance(given, tuple) else np.asarray(given)
 
     def acting(self, agent: str, action: Any) -> Any:
-        """Turn an action of the layout, stretched to the bounds of a Box, into what the environment takes.
+        """Turn an action of the layout, stretched to the bounds of a Box that it fits, into what the environment takes.
 
-        A task that defines it may act in any space, as Dict, Tuple or MultiDiscrete.
+        A task that defines it may act in any space, as Dict, MultiDiscrete or a Box of another shape.
         """
         return action
 
@@ -167,7 +167,8 @@ class Copy:
         self.kinds = {name: task.kind_of(name) for name in self.learners}
         self._width = max(kind.observation.width for kind in self.kinds.values())
         spaces = [foreign.space_of(self.env, name) for name in self.learners]
-        self._boxes = [foreign.bounds_of(space) for space in spaces]
+        kinds = self.kinds.values()
+        self._boxes = [foreign.bounds_of(space, kind.action) for space, kind in zip(spaces, kinds, strict=True)]
         starts = [getattr(space, "start", 0) for space in spaces]
         self._starts = [int(start) if np.ndim(start) == 0 else 0 for start in starts]
 
@@ -207,7 +208,7 @@ class Copy:
         task = self._task
         with self.naming("reset"):
             first, infos = self.start(0)
-        for name in self.learners:
+        for name, box in zip(self.learners, self._boxes, strict=True):
             with self.naming("reading"):
                 self.see(name, first[name])
             action = self.kinds[name].action
@@ -216,15 +217,14 @@ class Copy:
                 if size != action.count:
                     raise UserError(f"{name} has a mask of {size} actions, but the task has {action.count}")
             space = foreign.space_of(self.env, name)
-            if type(task).acting is not CopyHooks.acting and foreign.bounds_of(space) is None:
-                continue  # it makes of the layout's actions what the space holds
-            if isinstance(action, Discrete):
-                if getattr(space, "n", None) != action.count or space.shape != ():
-                    raise UserError(f"{name} acts in {space}, but the task says {action.count} discrete actions")
-            elif (box := foreign.bounds_of(space)) is None or space.shape != (action.width,):
-                raise UserError(f"{name} acts in {space}, but the task says {action.width} bounded real numbers")
-            else:
+            if box is not None and isinstance(action, Continuous):
                 foreign.require_round(action, task.symmetry, name, box)
+            elif type(task).acting is not CopyHooks.acting:
+                continue  # it makes of the layout's actions what the space holds
+            elif not isinstance(action, Discrete):
+                raise UserError(f"{name} acts in {space}, but the task says {action.width} bounded real numbers")
+            elif getattr(space, "n", None) != action.count or space.shape != ():
+                raise UserError(f"{name} acts in {space}, but the task says {action.count} discrete actions")
         if task.state is not None and not callable(getattr(self.env, "state", None)):
             raise UserError("the task says what the state is, but its environment has no 'state' method")
         if task.state is not None and (got := self.state().size) != task.state.width:

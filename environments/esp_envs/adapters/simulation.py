@@ -101,8 +101,11 @@ _STATE = ("pos", "vel", "rot", "ang_vel")  # what an entity's state holds; anyth
 class Entities:
     """The entities of a simulator as the global state."""
 
-    def __init__(self, sim: Any, own_goals: str, flags: Sequence[str], groups: Mapping[str, slice]) -> None:
+    def __init__(
+        self, sim: Any, own_goals: str, flags: Sequence[str], angles: Sequence[str], groups: Mapping[str, slice]
+    ) -> None:
         """Take the agents by role; the role "" is of a scenario without roles."""
+        self._angles = angles
         landmarks = sim.world.landmarks
         goals = [entity for entity in landmarks if own_goals and entity.name.startswith(own_goals)]
         if goals and len(goals) != len(sim.agents):
@@ -153,8 +156,10 @@ class Entities:
         columns = [("pos", "position", Kind.VECTOR, "length")]
         if first.movable:
             columns.append(("vel", "velocity", Kind.VECTOR, "length/s"))
-        if first.rotatable and type(first.shape).__name__ != "Sphere":
+        turns = first.rotatable and type(first.shape).__name__ != "Sphere"
+        if turns or first.name in self._angles:
             columns.append(("rot", "heading", Kind.VECTOR, "direction"))
+        if turns:
             columns.append(("ang_vel", "spin", Kind.PSEUDOSCALAR, "rad/s"))
         for what, word, kind, unit in columns:
             field = Field(f"{name}.{word}", kind, len(index), unit, items, family=family)

@@ -58,6 +58,10 @@ class VmasTask(Environment):
     """What the names of the landmarks begin with that belong to one agent each, in the agents' order."""
     flags: tuple[str, ...] = ()
     """Attributes of landmarks, 0 or 1 for each world, that belong to the state."""
+    angles: tuple[str, ...] = ()
+    """Landmarks that never turn, but stand at an angle that each episode draws; it belongs to the state."""
+    hidden: tuple[str, ...] = ()
+    """What decides what follows and is not in the state, as "clock"; see `TaskSpec`."""
     terminates: bool = False
     """Whether the scenario's `done`, if it has one, ends an episode; without it, `done` is a metric."""
     shared_reward: bool | Mapping[str, bool] = False
@@ -94,7 +98,7 @@ class VmasTask(Environment):
         given = self.seen()
         seen = given if isinstance(given, Mapping) else {"": given}
         self._groups = simulation.groups_of(self._sims[0].agents, list(seen) if isinstance(given, Mapping) else [])
-        self._entities = simulation.Entities(self._sims[0], self.own_goals, self.flags, self._groups)
+        self._entities = simulation.Entities(self._sims[0], self.own_goals, self.flags, self.angles, self._groups)
         self.spec = spec_with_roles(
             [
                 Role(
@@ -112,6 +116,7 @@ class VmasTask(Environment):
             horizon=self.settings.horizon,
             state=self._entities.layout,
             symmetry=self.symmetry,
+            hidden=self.hidden,
             terminates=self.terminates,
             totals=("done",) if self.terminates else (),
             settings=settings.model_dump(),

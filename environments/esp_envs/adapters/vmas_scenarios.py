@@ -208,9 +208,11 @@ def _lidar(rays: int, name: str = "lidar") -> Field:
     return Field(name, Kind.RING, rays=rays)
 
 
+_FINE = "angles to the last digit"  # which stiff joints feel
+
 BallPassage = _scenario("ball_passage", "from_goal", "from_ball", "from_passage", agents=2, fixed=True)
-BallTrajectory = _scenario("ball_trajectory", "from_ball", "again", agents=2, fixed=True)
-BuzzWire = _scenario("buzz_wire", "from_goal", agents=2, fixed=True)
+BallTrajectory = _scenario("ball_trajectory", "from_ball", "again", agents=2, fixed=True, hidden=(_FINE,))
+BuzzWire = _scenario("buzz_wire", "from_goal", agents=2, fixed=True, hidden=(_FINE,))
 Discovery = _scenario("discovery", _lidar(15), agents=5)
 Dropout = _scenario("dropout", "goal", Field("done", Kind.SCALAR), agents=4, flags=("eaten",))
 Football = _scenario(
@@ -220,11 +222,22 @@ Football = _scenario(
     arguments=lambda _: {"ai_red_agents": False},
     seen=lambda _: {"agent_blue": _player("agent_red"), "agent_red": _player("agent_blue")},
 )
-Flocking = _scenario("flocking", "from_target", _lidar(12), agents=4)
+Flocking = _scenario("flocking", "from_target", _lidar(12), agents=4, hidden=("the clock",))
 GiveWay = _scenario("give_way", agents=2, fixed=True, own_goals="goal")
-JointPassage = _scenario("joint_passage", "from_goal", "from_passage", "goal_direction", agents=2, fixed=True)
+JointPassage = _scenario(
+    "joint_passage",
+    *("from_goal", "from_passage", "goal_direction"),
+    agents=2,
+    fixed=True,
+    angles=("joint_goal",),
+    hidden=(_FINE,),
+)
 JointPassageSize = _scenario(
-    "joint_passage_size", "from_goal", "from_big", "from_small", "goal_direction", agents=2, fixed=True
+    "joint_passage_size",
+    *("from_goal", "from_big", "from_small", "goal_direction"),
+    agents=2,
+    fixed=True,
+    hidden=("which passage is big", _FINE),
 )
 MultiGiveWay = _scenario(
     "multi_give_way", "from_goal", Field("distance", Kind.SCALAR), agents=4, fixed=True, own_goals="goal"
@@ -239,4 +252,4 @@ Wheel = _scenario(
     agents=4,
     reading=_with_direction(10),
 )
-WindFlocking = _scenario("wind_flocking", agents=2, fixed=True)
+WindFlocking = _scenario("wind_flocking", agents=2, fixed=True, hidden=("what controllers remember",))

@@ -82,8 +82,16 @@ class FormationSettings(TaskSettings):
     )
 
     def without_effect(self) -> frozenset[str]:
-        idle = {"obstacle_radius_m"} if self.num_obstacles == 0 else set()
-        return frozenset(idle | ({"arena_m"} if self.density else set()))
+        alone = self.num_agents == 1 and self.num_obstacles == 0
+        idle = {
+            "obstacle_radius_m": self.num_obstacles == 0,
+            "arena_m": self.density is not None,
+            "neighbours": self.num_agents <= 2,  # there is one to see, or none
+            "sight": alone,
+            "collision_penalty": alone,
+            "penalty_radius_m": alone or self.penalty == 0,
+        }
+        return frozenset(name for name, is_idle in idle.items() if is_idle)
 
     @property
     def penalty(self) -> float:

@@ -11,6 +11,7 @@ from esp_envs import make
 from esp_envs.epuck import formation_rules as rules
 from esp_envs.epuck import formation_spec
 from esp_envs.epuck.formation import Formation
+from esp_envs.epuck.formation_spec import FormationSettings
 from esp_envs.epuck.robot import BODY_RADIUS_M, MAX_SPEED_M_S, MAX_SPIN_RAD_S, Arena
 from tests.envs.playing import episode_return
 
@@ -366,3 +367,29 @@ def test_anchors(settings: dict[str, object], policy: str, expected: float) -> N
     env = make("formation", 24, [5], settings)
     mean, error = episode_return(env, policy)
     assert mean == pytest.approx(expected, abs=max(4 * error, 1.0))
+
+
+PENALTIES = ("collision_penalty", "penalty_radius_m")
+IDLE = [
+    ({}, set()),
+    ({"num_agents": 2, "num_obstacles": 0}, {"obstacle_radius_m", "neighbours"}),
+    ({"num_agents": 1}, {"neighbours"}),
+    ({"num_agents": 1, "num_obstacles": 0}, {"obstacle_radius_m", "neighbours", "sight", *PENALTIES}),
+    ({"collision_penalty": 0.0}, {"penalty_radius_m"}),
+    ({"density": 0.8}, {"arena_m"}),
+]
+
+
+@pytest.mark.parametrize(("settings", "idle"), IDLE, ids=str)
+def test_settings_that_change_nothing_are_named(settings, idle: set[str]) -> None:
+    others = {"obstacle_radius_m": 0.04, "neighbours": 9, "sight": "nearness", "collision_penalty": 0.9}
+    others |= {"penalty_radius_m": 1.9, "arena_m": 2.5}
+
+    def played(more: dict[str, object]) -> list[float]:
+        env = make("formation", 1, [0], {**settings, **more})
+        env.reset()
+        step = env.step(env.heuristic())
+        return [*step.next.obs.flatten().tolist(), *step.reward.flatten().tolist()]
+
+    assert FormationSettings(**settings).without_effect() == idle
+    assert all(played({name: others[name]}) == played({}) for name in idle)
