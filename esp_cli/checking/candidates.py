@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.checking.shifting import Shift
+from esp_cli.checking.verdicts import ElementVerdict
 from esp_cli.symmetry import Element, FiniteGroup, Group, build_transform, parse_elements
 from esp_cli.symmetry.admission import DISCOVERED, declares, exchangeable, moves_some_number, scene_of
 from esp_cli.symmetry.elements import order_name
@@ -50,9 +51,16 @@ def candidates(spaces: Spaces, transforms: str | None = None) -> list[Element]:
     return found
 
 
-def refused(spaces: Spaces, transforms: str) -> dict[str, str]:
-    """Return why elements that are asked for cannot be tried, by their names."""
-    return {element.name: told for element, told in _refusals([transforms], spaces).items() if told is not None}
+def refused(spaces: Spaces, transforms: str | None = None) -> tuple[ElementVerdict, ...]:
+    """Return the elements that cannot be tried: of those asked for, else of the declared ones."""
+    refusals = _refusals(_defaults(spaces) if transforms is None else [transforms], spaces).items()
+    found = (ElementVerdict(e.name, is_declared(e, spaces), (), told) for e, told in refusals if told is not None)
+    return tuple(one for one in found if one.declared or transforms is not None)
+
+
+def turns_freely(spaces: Spaces) -> bool:
+    """Return whether actions and layouts carry a turn by any angle, and not by parts of a ring alone."""
+    return all(_refusal(element, spaces) is None for element in _elements("so2", spaces.num_agents))
 
 
 def _refusals(texts: Sequence[str], spaces: Spaces) -> dict[Element, str | None]:
@@ -126,14 +134,18 @@ def _elements(text: str, num_agents: int) -> tuple[Element, ...]:
     return tuple(chosen)
 
 
-def named(accepted: Sequence[Element], tried: Sequence[Element], scene: str = "") -> tuple[str, str]:
+def named(
+    accepted: Sequence[Element], tried: Sequence[Element], scene: str = "", freely: bool = True
+) -> tuple[str, str]:
     """Return the name of the largest group that the accepted elements close to, and what `--transforms` takes.
+
+    Turns by odd angles stand for all where the task `turns_freely`, else for those that they generate.
 
     A group of the scene, as of legs, is looked at too. It counts where all of its elements that were tried are
     accepted, and generate it; coupled generators, as flip-x*agents-1-0, count one by one. All orders of agents, or of a
     field's items, count where those that were tried are accepted and generate them.
     """
-    plane, text = _scene([e for e in accepted if not e.orders], [e for e in tried if not e.orders], scene)
+    plane, text = _scene([e for e in accepted if not e.orders], [e for e in tried if not e.orders], scene, freely)
     whole, single = _orders_of(accepted, tried)
     glue = " and " if "," in plane else "*"
     name = " and ".join([glue.join((plane, *whole)), *([",".join(single)] if single else [])])
@@ -143,14 +155,15 @@ def named(accepted: Sequence[Element], tried: Sequence[Element], scene: str = ""
     return name, next((DISCOVERED + part for part in texts if part and _is_readable(part, accepted)), "")
 
 
-def _scene(accepted: Sequence[Element], tried: Sequence[Element], scene: str) -> tuple[str, str]:
+def _scene(accepted: Sequence[Element], tried: Sequence[Element], scene: str, freely: bool) -> tuple[str, str]:
     """Return the name and `--transforms` of the largest group of the scene whose tried elements are all accepted."""
     held, seen = set(accepted), {e: PlaneElement.of(e) for e in tried if _is_planar(e)}
     turns, mirrors = ([e for e, plane in seen.items() if plane.mirrored == mirrored] for mirrored in (False, True))
-    if held.issuperset(turns) and any(seen[e].turn.denominator > _MOST_CORNERS for e in turns):
+    most = _MOST_CORNERS if freely else math.inf
+    if held.issuperset(turns) and any(seen[e].turn.denominator > most for e in turns):
         name = "o2" if mirrors and held.issuperset(mirrors) else "so2"
         return name, name
-    groups = _polygon_groups({e: plane for e, plane in seen.items() if plane.turn.denominator <= _MOST_CORNERS})
+    groups = _polygon_groups({e: plane for e, plane in seen.items() if plane.turn.denominator <= most})
     if scene and "*" not in scene and not any(_is_planar(e) for e in _listed(scene)):
         groups.append((scene, _listed(scene)))
     best, text, size = "c1", "", 1

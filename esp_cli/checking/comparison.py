@@ -1,7 +1,7 @@
 """Compare a step from a state with the step from the transformed state, as distributions.
 
-From each state s and joint action a, two runs with chance of their own give outcomes X and X', transformed by g; two
-runs from L_g s with K_g a give Y and Y'. The energy distance
+From each state s and joint action a, runs with chance of their own give outcomes X and X', transformed by g; as many
+from L_g s with K_g a give Y and Y'. The energy distance
 
     E |X - Y| - (E |X - X'| + E |Y - Y'|) / 2
 
@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import combinations, product
 
 import torch
 from torch import Tensor
@@ -86,9 +87,8 @@ def beside_what_is_seen(name: str, sides: Sequence[Outcomes], near: Outcomes) ->
     rows, _ = _known(*(torch.cat([side[one] for one in names], 1) for side in (*sides, near)))
     tolerance = NEGLIGIBLE * rows[0].std(0).clamp_min(1e-6)
     is_clear = (_ROUNDINGS * (rows[0] - rows[-1]).abs() <= tolerance).all(1)
-    x, x2, y, y2 = (side[is_clear] for side in rows[:4])
-    within, across = ((x - x2, y - y2), (x - y, x2 - y2, x - y2, x2 - y))
-    samples = _excess(lambda gap: (gap.abs() > tolerance).any(1, keepdim=True).double(), within, across)
+    gaps = _gaps([side[is_clear] for side in rows[:-1]])
+    samples = _excess(lambda gap: (gap.abs() > tolerance).any(-1, keepdim=True).double(), *gaps)
     share, error = float(samples.mean()), float(samples.std()) / max(1, len(samples)) ** 0.5
     return FieldVerdict(name, "broken", share, error, share=share) if share > max(SIGNIFICANT * error, FEW) else None
 
@@ -96,7 +96,7 @@ def beside_what_is_seen(name: str, sides: Sequence[Outcomes], near: Outcomes) ->
 def by_distances(
     name: str, sides: Sequence[Outcomes], together: Sequence[str] = (), worlds: Tensor | None = None
 ) -> FieldVerdict:
-    """Judge one field with chance, or some together, from four runs: two that are transformed and two from images.
+    """Judge one field with chance, or some together, from runs: half of them are transformed, half are from images.
 
     Rows are independent, or else those of each of the `worlds`, [M] numbers from 0, count once.
     """
@@ -104,28 +104,29 @@ def by_distances(
     rows, known = _known(*(torch.cat([side[field] for field in fields], 1) for side in sides))
     if not len(rows[0]):
         return FieldVerdict(name, "not covered", float("nan"), float("nan"))
-    pairs = ((sides[0][field][known], sides[2][field][known], _before(field, sides[0], known)) for field in fields)
+    pairs = ((sides[0][field][known], sides[-1][field][known], _before(field, sides[0], known)) for field in fields)
     each = [_units(*pair)[0] for pair in pairs]
     units, shares = torch.cat(each), torch.cat([torch.full_like(unit, len(unit) ** -0.5) for unit in each])
-    x, x2, y, y2 = (side / units for side in rows)
-    within, across = ((x - x2, y - y2), (x - y, x2 - y2, x - y2, x2 - y))
+    here, there, across = _gaps([side / units for side in rows])
     # of all numbers at once, since chance may tie them together
-    tests = [_excess(lambda gap: (gap * shares).norm(dim=1, keepdim=True), within, across)]
+    tests = [_excess(lambda gap: (gap * shares).norm(dim=-1, keepdim=True), here, there, across)]
     if not together:
         # The second distance is bounded, so that rare large chance (a touch, a capture) hides no small constant fault.
         distances = (Tensor.abs, lambda gap: _BOUND * -torch.expm1(-gap.abs() / _BOUND))
-        tests += [_excess(distance, within, across) for distance in distances]
-        tests.append((x + x2 - y - y2) / 2)
-        tests.append(((x - x2).abs() - (y - y2).abs()) * _OF_GINI)
+        tests += [_excess(distance, here, there, across) for distance in distances]
+        tests.append(across.mean(0))
+        tests.append((here.abs().mean(0) - there.abs().mean(0)) * _OF_GINI)
     samples = torch.cat(tests, 1).double()
     if worlds is not None:
         _, worlds, counts = worlds[known].unique(return_inverse=True, return_counts=True)
         sums = samples.new_zeros(len(counts), samples.shape[1]).index_add_(0, worlds, samples)
         samples = sums * len(counts) / counts.sum()
     gaps, errors = samples.mean(0).abs(), samples.std(0) / len(samples) ** 0.5
-    chances = torch.special.ndtr((gaps - TOLERATED) / errors.clamp_min(1e-12))
+    tolerated = torch.full_like(gaps, TOLERATED)
+    tolerated[: 0 if together else 3] = TOLERATED**2  # the distances grow as the square of a shift
+    chances = torch.special.ndtr((gaps - tolerated) / errors.clamp_min(1e-12))
     if worlds is None:
-        of_pairs = _covariances(*within)
+        of_pairs = _covariances(here[0], there[0])
         gaps, errors = torch.cat([gaps, of_pairs[0]]), torch.cat([errors, of_pairs[1]])
     broken = (gaps > SIGNIFICANT * errors) & (gaps > NEGLIGIBLE)
     worst = int(torch.where(broken, gaps, gaps * (not broken.any()))[: None if broken.any() else len(chances)].argmax())
@@ -176,10 +177,17 @@ def _each_state(name: str, apart: Tensor, rounding: Tensor, scale: float, units:
     return concluded(name, gap, 0.0, bool(differ.any()), float(unclear > _UNCLEAR), share)
 
 
-def _excess(distance: Callable[[Tensor], Tensor], within: Sequence[Tensor], across: Sequence[Tensor]) -> Tensor:
-    """Return by how much outcomes of the two sides lie further apart than those of one side [M, 1]."""
-    apart = torch.stack([distance(gap) for gap in across]).mean(0)
-    own = torch.stack([distance(gap) for gap in within]).mean(0)
+def _gaps(runs: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """Return differences of each two runs of the first half, of the second, and across halves: [pairs, M, D] each."""
+    sides = runs[: len(runs) // 2], runs[len(runs) // 2 :]
+    pairs = (*(combinations(side, 2) for side in sides), product(*sides))
+    first, second, across = (torch.stack([x - y for x, y in each]) for each in pairs)
+    return first, second, across
+
+
+def _excess(distance: Callable[[Tensor], Tensor], first: Tensor, second: Tensor, across: Tensor) -> Tensor:
+    """Return by how much outcomes of the two sides lie further apart than those of one side [M, 1]; see `_gaps`."""
+    apart, own = distance(across).mean(0), distance(torch.cat([first, second])).mean(0)
     return (apart - own).mean(1, keepdim=True)
 
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.checking.recorded import Transitions
+from esp_cli.checking.shifting import leaves
 from esp_envs.spec import Layout
 
 STILL = 1e-6  # standard deviation below which a number does not change
@@ -46,7 +47,7 @@ def planes(layout: Layout, obs: Tensor) -> list[list[int]]:
     """Return the numbers of obs [M, T, N, D] that change: vectors' two by two, and the others; of many, every k-th."""
     live = (obs.std((0, 1, 2)) > STILL).tolist()
     pairs, single = list[list[int]](), list[int]()
-    for field, where in zip(layout.fields, layout.slices().values(), strict=True):
+    for field, where in leaves(layout.fields):
         numbers = range(where.start, where.stop)
         if field.kind.is_vector:
             pairs += [[a, a + 1] for a in numbers[::2] if live[a] or live[a + 1]]

@@ -25,7 +25,7 @@ from esp_cli.checking.comparison import (
 )
 from esp_cli.checking.shifting import Shift, Unmoved
 from esp_cli.checking.stepping import nudged, outcomes, played, seek_end, stretched, visit
-from esp_cli.checking.verdicts import ElementVerdict, FieldVerdict, Late, Watch, may_come, verdicts_of
+from esp_cli.checking.verdicts import ENDS, ElementVerdict, FieldVerdict, Watch, may_come, verdicts_of
 from esp_cli.symmetry import Element, Transform, build_transform
 from esp_envs.promises import MakeWorlds
 from esp_envs.spec import TaskSpec
@@ -34,7 +34,7 @@ _FEWEST_WORLDS, _MOST_WORLDS = 64, 256
 _NUMBERS = 1 << 18  # that all worlds together may show their agents at once; with pictures they are fewer
 _SOME, _FOLLOWED = 8, 4
 """Of more elements than `_SOME`, each is first tried in one of so many states; later steps are those of `_FOLLOWED`."""
-_FURTHER = "holds where play went, but further out {} would differ"
+_BEYOND = "holds where play went, but {} {} would differ"
 _TOGETHER = "fields together"
 _UNMOVED = "it moves nothing in the states that play visits"
 _HIDDEN = "the state leaves out {}, and later steps do not tell what that does"
@@ -42,7 +42,11 @@ _LATER, _LATER_OF_SLOW = 128, 32
 """Steps that are followed from an episode's start, for what builds up that no state holds, or until an end is found;
 of slow simulators fewer."""
 _LONG = 0.25  # share of the states that differ from which rounding is no reason, however many steps it had to grow
-_HERE, _THERE = (101, 102), (103, 104)  # seeds of two runs from the states, two from images, with own chance
+_HERE, _THERE = (
+    (101, 102, 105, 107),
+    (103, 104, 106, 108),
+)  # seeds of runs from states, and from images, with own chance
+_NEAR = -1  # stands for a run from states nearby, with the chance of the first
 Visited = tuple[Tensor, Tensor]  # states [1, E, state width] and joint actions
 
 
@@ -88,10 +92,11 @@ class _Judge:
         if self._quick and (found := self._fewer.judge(element)).outcome == "broken":
             return found
         found = self._everywhere.judge(element)
-        if found.outcome == "not covered" and [f.field for f in found.fields if f.outcome != "holds"] == ["end"]:
-            found = self._as_at_an_end(element, found)
+        unseen = {f.field for f in found.fields if f.outcome != "holds"}
+        if found.outcome == "not covered" and unseen and unseen <= ENDS and self._ending is not None:
+            found = self._as_at_an_end(found, self._ending.judge(element))
         if found.outcome == "holds" and self._further is not None:
-            found = self._as_further_out(element, found)
+            found = self._as_beyond(found, self._further.judge(element), "further out", self._few)
         return self._as_later(element, found) if found.outcome == "holds" else found
 
     @cached_property
@@ -128,25 +133,22 @@ class _Judge:
             return _Pairs(self._make, moments(), self._until, onwards)
         return None
 
-    def _as_at_an_end(self, element: Element | Shift, found: ElementVerdict) -> ElementVerdict:
-        """Judge ends that did not come in play where one was found."""
-        near = None if self._ending is None else self._ending.judge(element)
-        ends = [f for f in near.fields if f.field == "end" and f.outcome == "holds"] if near else []
-        return replace(found, fields=tuple(ends[0] if f.field == "end" else f for f in found.fields)) if ends else found
+    def _as_at_an_end(self, found: ElementVerdict, near: ElementVerdict) -> ElementVerdict:
+        """Judge ends that did not come in play, and all that comes with them, where one was found."""
+        ends = {f.field: f for f in near.fields if f.field in ENDS and f.outcome == "holds"}
+        found = replace(found, fields=tuple(ends.get(f.field, f) for f in found.fields))
+        return self._as_beyond(found, near, "at an end", 0.0) if found.outcome == "holds" else found
 
-    def _as_further_out(self, element: Element | Shift, found: ElementVerdict) -> ElementVerdict:
-        assert self._further is not None
-        beyond = self._further.judge(element)
-        broken = (f for f in beyond.fields if f.outcome == "broken" and not f.share <= self._few)  # a share may be NaN
+    def _as_beyond(self, found: ElementVerdict, beyond: ElementVerdict, where: str, few: float) -> ElementVerdict:
+        """Say that what holds is not covered where fields are broken in states that play did not reach."""
+        broken = (f for f in beyond.fields if f.outcome == "broken" and not f.share <= few)  # a share may be NaN
         fields = tuple(replace(f, outcome="not covered") for f in broken)
         if not fields:
             return found
-        return replace(found, fields=fields, reason=_FURTHER.format(", ".join(field.field for field in fields)))
+        return replace(found, fields=fields, reason=_BEYOND.format(where, ", ".join(field.field for field in fields)))
 
     def _as_later(self, element: Element | Shift, found: ElementVerdict) -> ElementVerdict:
-        broken = None
-        with suppress(Late):
-            broken = self._onwards.broken_later(element) if self._onwards is not None else None
+        broken = None if self._onwards is None else self._onwards.broken_later(element)
         if broken is None and self._spec.hidden:
             return replace(found, fields=(), reason=_HIDDEN.format(" and ".join(self._spec.hidden)))
         return replace(found, fields=broken) if broken else found
@@ -161,37 +163,35 @@ class _Pairs:
     def __init__(self, make: MakeWorlds, visited: Sequence[Visited], until: float, onwards: bool = False) -> None:
         self._visited, worlds = visited, visited[0][0].shape[1]
         self._play = partial(outcomes, until=until, onwards=onwards)
-        self._twins = [make(worlds, [seed]) for seed in _HERE]
+        self._twins = [make(worlds, [seed]) for seed in _HERE[:2]]
         for env in self._twins:
             env.renews = False
         self._spec = self._twins[0].spec
-        self._here = [self._play(env, visited, Unmoved(), seed) for env, seed in zip(self._twins, _HERE, strict=True)]
+        self._here = cache(lambda run: self._play(self._twins[min(run, 1)], visited, Unmoved(), _HERE[run]))
+        self._here(0), self._here(1)
         near = [(nudged(state), action) for state, action in visited]
-        self._here.append(self._play(self._twins[0], near, Unmoved(), _HERE[0]))
+        self._near = self._play(self._twins[0], near, Unmoved(), _HERE[0])
 
     def judge(self, element: Element | Shift) -> ElementVerdict:
         """Compare the steps from the images with the images of the steps."""
         declared, transform = is_declared(element, self._spec), self._transform(element)
         image = cache(partial(self._image, transform))
 
-        @cache
-        def apart() -> list[Outcomes]:
-            return [self._there(transform, twin, seed) for twin, seed in enumerate(_THERE)]
-
+        runs = cache(partial(self._runs, transform))
         first = image(0)
         try:
             alike = self._there(transform, 0, _HERE[0])
             verdicts = [
                 self._unseen(name, first, alike)
                 or the_same(name, first, alike)
-                or state_by_state(name, first, image(1), alike, image(2))
-                or beside_what_is_seen(name, (first, image(1), *apart()), image(2))
-                or by_distances(name, (first, image(1), *apart()))
+                or state_by_state(name, first, image(1), alike, image(_NEAR))
+                or beside_what_is_seen(name, runs(), image(_NEAR))
+                or by_distances(name, runs())
                 for name in first
             ]
             if all(v.outcome == "holds" for v in verdicts) and any(math.isnan(v.share) for v in verdicts):
                 drawn = [name for name in first if not torch.equal(first[name], image(1)[name])]
-                verdicts.append(by_distances(_TOGETHER, (first, image(1), *apart()), drawn))
+                verdicts.append(by_distances(_TOGETHER, runs(), drawn))
         except (Exception, SystemExit) as error:
             reason = f"the task raises in the transformed states: {type(error).__name__}: {error}"
             return ElementVerdict(element.name, declared, (), reason)
@@ -221,7 +221,7 @@ class _Pairs:
         unlike = [name for name in first if not the_same(name, first, alike)]
         if not unlike:
             return ()
-        second, near = self._image(transform, 1), self._image(transform, 2)
+        second, near = self._image(transform, 1), self._image(transform, _NEAR)
         sides = (first, second, alike, near)
         goes = _until_an_end(sides, worlds)
         # in either half of the worlds: an event that rounding tips in one of them is no breaking
@@ -233,7 +233,7 @@ class _Pairs:
         verdicts = {name: [state_by_state(name, *half) for half in halves] for name in names}
         verdicts |= {f"{name} later": [state_by_state(name, *whole)] for name in names}
         if drawn := [name for name in names if None in verdicts[name]]:
-            verdicts |= self._drawn_later(drawn, transform, first, second)
+            verdicts |= self._drawn_later(drawn, transform)
         least = 0.5 / min(len(self._visited), _LATER_OF_SLOW)
         broken = [
             told[0]
@@ -244,11 +244,11 @@ class _Pairs:
         return tuple(merged([v for v in broken if v])) if broken or holds else None
 
     def _drawn_later(
-        self, names: Sequence[str], transform: Transform | Unmoved, first: Outcomes, second: Outcomes
+        self, names: Sequence[str], transform: Transform | Unmoved
     ) -> dict[str, list[FieldVerdict | None]]:
         """Judge fields that chance decides in all steps, of which those of a world count once."""
         try:
-            sides = (first, second, *(self._there(transform, twin, seed) for twin, seed in enumerate(_THERE)))
+            sides = self._runs(transform)
         except (Exception, SystemExit):
             return {}
         worlds = self._visited[0][0].shape[1]
@@ -260,20 +260,26 @@ class _Pairs:
         return element if isinstance(element, Shift) else build_transform([element], self._spec)
 
     def _image(self, transform: Transform | Unmoved, run: int) -> Outcomes:
-        """Return transformed outcomes of one of the runs from the states: two, and one from states nearby."""
-        return by_field(self._here[run], self._spec, transform)
+        """Return transformed outcomes of one of the runs from the states, or from states nearby."""
+        return by_field(self._near if run == _NEAR else self._here(run), self._spec, transform)
+
+    def _runs(self, transform: Transform | Unmoved) -> list[Outcomes]:
+        """Return transformed outcomes of all runs from the states, and outcomes of as many from the images."""
+        images = [self._image(transform, run) for run in range(len(_HERE))]
+        return [*images, *(self._there(transform, min(run, 1), seed) for run, seed in enumerate(_THERE))]
 
     def _there(self, transform: Transform | Unmoved, twin: int, seed: int) -> Outcomes:
         """Return outcomes of the images."""
         return by_field(self._play(self._twins[twin], self._visited, transform, seed), self._spec, Unmoved())
 
     def _unseen(self, name: str, first: Outcomes, alike: Outcomes) -> FieldVerdict | None:
-        """Say that ends, or rewards, which never came or never changed could not have shown a breaking."""
+        """Say that ends, masks or rewards which never came or never changed could not have shown a breaking."""
         rows = torch.cat([first[name], alike[name]])
-        if name not in ("reward", "end") or bool((rows != rows[:1]).any()):
+        if bool((rows != rows[:1]).any()):
             return None
         ends = bool(first["end"].any()) and not bool(first["end"].all())
-        unseen = may_come(name, ends, bool(rows.any())) and (name != "end" or self._spec.terminates)
+        may = may_come(name, ends, pays=bool(rows.any()), forbids=not bool(rows.all()))
+        unseen = may and (name != "end" or self._spec.terminates)
         return FieldVerdict(name, "not covered", 0.0, 0.0) if unseen else None
 
 

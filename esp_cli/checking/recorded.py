@@ -22,7 +22,7 @@ from esp_envs.spec import Discrete, Spaces
 EPISODES = 2048
 STEPS = 8  # steps of each episode that are looked at
 _MOST_BYTES = 2**31
-_NEEDED, _OPTIONAL = ("obs", "action", "reward", "next_obs"), ("action_mask", "terminated")
+_NEEDED, _OPTIONAL = ("obs", "action", "reward", "next_obs"), ("action_mask", "terminated", "alive")
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,7 @@ class Transitions:
         reward: [M, T, N].
         action_mask: [M, T, N, A] bool, the actions that were allowed; None where all always are.
         terminated: [M, T, N] bool, whether the step ended the episode for good; None where none does.
+        alive: [M, T, N] bool, which agents still act after the step; None where they end with the episode alone.
     """
 
     obs: Tensor
@@ -46,6 +47,7 @@ class Transitions:
     next_obs: Tensor
     action_mask: Tensor | None = None
     terminated: Tensor | None = None
+    alive: Tensor | None = None
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Transitions:
         """Return transitions with every tensor put through a function."""
@@ -84,6 +86,8 @@ def collect(
                 row["action_mask"] = observation.action_mask
             if env.spec.terminates:
                 row["terminated"] = step.terminated.unsqueeze(-1).expand_as(step.reward)
+            if step.reached.alive is not None:
+                row["alive"] = step.reached.alive
             rows.append({name: picked(over, rows[-1][name], new) for name, new in row.items()} if rows else row)
             over = over | step.ended
             observation = step.next
@@ -103,12 +107,12 @@ def picked(flags: Tensor, there: Tensor, elsewhere: Tensor) -> Tensor:
     return torch.where(flags.view(*flags.shape, *(1,) * (there.dim() - 2)), there, elsewhere)
 
 
-def outputs_of(data: Transitions) -> Tensor:
-    """Return what a regression predicts of each agent, [M, T, N, D + 1]: change, reward, and any mask and end."""
-    outputs = [data.next_obs - data.obs, data.reward.unsqueeze(-1)]
-    outputs += [] if data.action_mask is None else [data.action_mask.float()]
-    outputs += [] if data.terminated is None else [data.terminated.float().unsqueeze(-1)]
-    return torch.cat(outputs, -1)
+def outputs_of(data: Transitions) -> dict[str, Tensor]:
+    """Return what a regression predicts of each agent, [M, T, N, numbers] each: change, reward, any mask and ends."""
+    flags = {"action mask": data.action_mask, "end": data.terminated, "alive": data.alive}
+    found = {"obs": data.next_obs - data.obs, "reward": data.reward}
+    found |= {name: flag.float() for name, flag in flags.items() if flag is not None}
+    return {name: part if part.dim() == data.obs.dim() else part.unsqueeze(-1) for name, part in found.items()}
 
 
 def turned(data: Transitions, transform: Transform) -> Transitions:
@@ -124,8 +128,8 @@ def read_transitions(path: Path, spaces: Spaces) -> Transitions:
 
     Args:
         path: of an .npz file with obs and next_obs [M, T, N, D], action [M, T, N] of integers or [M, T, N, width],
-            reward [M, T, N], and where the task has them action_mask [M, T, N, A] and terminated [M, T, N]; the axis T
-            may be left out.
+            reward [M, T, N], and where the task has them action_mask [M, T, N, A], terminated and alive [M, T, N]; the
+            axis T may be left out.
         spaces: what the numbers are.
 
     Raises:
@@ -142,11 +146,12 @@ def read_transitions(path: Path, spaces: Spaces) -> Transitions:
         if array.dtype.kind not in ("iu" if integer else "fiub"):
             raise UserError(f"'{name}' of {path} holds {array.dtype}; save {'integers' if integer else 'numbers'}")
         tensor = torch.from_numpy(array.astype(np.int64 if integer else np.float32))
-        per_agent = name in ("reward", "terminated") or integer
+        per_agent = name in ("reward", "terminated", "alive") or integer
         tensors[name] = tensor.unsqueeze(1) if tensor.ndim == (2 if per_agent else 3) else tensor
-    mask, ends = tensors.pop("action_mask", None), tensors.pop("terminated", None)
-    allowed = None if mask is None or not whole else mask > 0
-    return Transitions(**tensors, action_mask=allowed, terminated=None if ends is None else ends > 0)
+    tensors |= {name: tensors[name] > 0 for name in _OPTIONAL if name in tensors}
+    if not whole:
+        tensors.pop("action_mask", None)
+    return Transitions(**tensors)
 
 
 def _arrays(path: Path) -> dict[str, np.ndarray]:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
 
 from esp_cli.symmetry import Element
 from esp_envs.errors import UserError
-from esp_envs.spec import Field, Spaces
+from esp_envs.spec import Field, Kind, Spaces
 
 SHIFT = "shift"  # its name as a check takes it; no prior needs it, as networks over sets see no place of such a task
 _BY = [1.2361, -0.7639]  # in the unit of a place: no multiple of what floors are tiled in
@@ -48,8 +48,16 @@ class Shift(Unmoved):
 
 def _ways(fields: Sequence[Field]) -> list[float]:
     """Return how far each number of a row is moved."""
-    ways = list[float]()
+    moved = ((_BY if part.is_point else [0.0, 0.0], where.stop - where.start) for part, where in leaves(fields))
+    return [way[k % 2] for way, width in moved for k in range(width)]
+
+
+def leaves(fields: Sequence[Field], start: int = 0) -> Iterator[tuple[Field, slice]]:
+    """Yield the fields that a row consists of, and where; records fall into their parts, item by item."""
     for field in fields:
-        item = _ways(field.parts) if field.parts else _BY if field.is_point else [0.0] * field.item_width
-        ways += item * (field.width // len(item) if item else 0)
-    return ways
+        if field.kind == Kind.RECORD:
+            for item in range(start, start + field.width, field.item_width):
+                yield from leaves(field.parts, item)
+        else:
+            yield field, slice(start, start + field.width)
+        start += field.width

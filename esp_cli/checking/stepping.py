@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from esp_cli.checking.recorded import picked
-from esp_cli.checking.shifting import Unmoved
+from esp_cli.checking.shifting import Unmoved, leaves
 from esp_cli.checking.verdicts import Watch, stop_at
 from esp_cli.symmetry import Element, Transform, build_transform
 from esp_envs.base import Environment, Observation, Step, joined
@@ -141,27 +141,34 @@ def _joint_image(spec: TaskSpec, scene: Element) -> Callable[[Tensor], Tensor]:
 
 
 def seek_end(make: MakeWorlds, state: Tensor, steps: int, until: float) -> tuple[Tensor, Tensor]:
-    """Return states [1, E, state width] and actions, some of which end an episode as play did not, or a LookupError.
+    """Return states [1, E, state width] and actions, of which up to a quarter end something; else a LookupError.
 
-    In half of the worlds all things gather first, as at a goal. Worlds act at random, and go on from the quarter of
-    them that was paid most so far.
+    That is an episode, or what one agent does, as play did not. In half of the worlds all things gather first, as at a
+    goal. Worlds act at random, and go on from the quarter of them that was paid most so far.
     """
     env = make(state.shape[1], [0])
     env.renews, half = False, env.num_envs // 2
     state = torch.cat([stretched(state[:, :half], env.spec.state, decades=-3.0), state[:, half:]], 1)
     paid, count = torch.zeros(env.num_envs, device=state.device), max(1, env.num_envs // 4)
+    first, ends = None, list[tuple[Tensor, Tensor]]()
     for _ in range(steps):
         stop_at(until)
         env.reset()
         env.set_state(state)
         action = env.random_action()
         step = env.step(action)
-        if bool(step.terminated.any()):
-            return state, action
+        first, alive = first or (state, action), step.reached.alive
+        over = (step.terminated if alive is None else step.terminated | ~alive.all(-1))[0]
+        ends.append((state[:, over], action[:, over]))
+        if sum(len(ended[0]) for ended, _ in ends) >= count:
+            break
         paid = paid + step.reward.flatten(0, 1).flatten(1).mean(-1).nan_to_num(-torch.inf)
         best = paid.topk(count).indices.repeat(-(-env.num_envs // count))[: env.num_envs]
         state, paid = step.reached.state[:, best], paid[best]
-    raise LookupError
+    ended, done = (torch.cat(part, 1)[:, :count] for part in zip(*ends, strict=True))
+    if first is None or not ended.shape[1]:
+        raise LookupError
+    return torch.cat([ended, first[0][:, ended.shape[1] :]], 1), torch.cat([done, first[1][:, ended.shape[1] :]], 1)
 
 
 def played(make: MakeWorlds, state: Tensor, steps: int, seed: int, until: float) -> list[tuple[Tensor, Tensor]]:
@@ -183,7 +190,7 @@ def stretched(state: Tensor, layout: Layout, decades: float = 1.0) -> Tensor:
     share = torch.rand(state.shape[1], 1, generator=torch.Generator().manual_seed(0)).to(state.device)
     factor = 10 ** (decades * share)
     out = state.clone()
-    for field, where in zip(layout.fields, layout.slices().values(), strict=True):
+    for field, where in leaves(layout.fields):
         if field.kind.is_vector and not bool((state[..., where] == state[..., where].round()).all()):  # no cells
             out[..., where] *= factor
     return out

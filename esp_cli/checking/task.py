@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from esp_cli.checking import comparison, paired, transitions
-from esp_cli.checking.candidates import candidates, named, refused
+from esp_cli.checking.candidates import candidates, named, refused, turns_freely
 from esp_cli.checking.recorded import Transitions, collect
 from esp_cli.checking.shifting import SHIFT, Shift
 from esp_cli.checking.verdicts import ElementVerdict, Watch
@@ -40,7 +40,7 @@ class SymmetryReport:
     found: str  # the largest group whose tried elements all hold: "d4*agents", "flip-x", "c1" for nothing
     transforms: str  # what `--transforms` takes to use it; empty where nothing was found
     elements: tuple[ElementVerdict, ...]
-    refused: Mapping[str, str]  # why elements that were asked for could not be tried, by their names
+    refused: tuple[ElementVerdict, ...]  # that could not be tried, of those asked for, else of the declared ones
 
     @property
     def broken(self) -> tuple[str, ...]:
@@ -54,11 +54,11 @@ class SymmetryReport:
 
     @property
     def holds(self) -> bool:
-        """Whether every declared element that was tried holds."""
+        """Whether every declared element holds."""
         return not self.broken and not self.uncovered
 
     def _declared(self, outcome: str) -> tuple[str, ...]:
-        return tuple(e.element for e in self.elements if e.declared and e.outcome == outcome)
+        return tuple(e.element for e in (*self.elements, *self.refused) if e.declared and e.outcome == outcome)
 
 
 def check_symmetry(
@@ -149,6 +149,7 @@ def _reported(
     transforms: str | None,
 ) -> SymmetryReport:
     holding = [e for e, verdict in zip(elements, verdicts, strict=False) if verdict.outcome == "holds"]
-    found, usable = named(holding, elements, scene_of(spaces.symmetry, spaces.num_agents))
-    left_out = {} if transforms in (None, SHIFT) else refused(spaces, transforms)
+    scene = scene_of(spaces.symmetry, spaces.num_agents)
+    found, usable = named(holding, elements, scene, turns_freely(spaces))
+    left_out = () if transforms == SHIFT else refused(spaces, transforms)
     return SymmetryReport(source, method, spaces.symmetry, found, usable, tuple(verdicts), left_out)

@@ -15,9 +15,10 @@ them would have raised the gap so far that one as small as what is found has a p
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from functools import cache
+from itertools import accumulate, pairwise
 from typing import NamedTuple
 
 import torch
@@ -30,7 +31,7 @@ from esp_cli.checking.recorded import Transitions, outputs_of, turned
 from esp_cli.checking.verdicts import SIGNIFICANT, ElementVerdict, FieldVerdict, Watch, concluded, may_come, verdicts_of
 from esp_cli.symmetry import Element, Transform, build_transform
 from esp_envs.errors import UserError
-from esp_envs.spec import Discrete, Spaces
+from esp_envs.spec import Discrete, Spaces, TaskSpec
 
 FEWEST = 64  # episodes (or single transitions) below which nothing can be told
 TOLERATED = 0.2  # standard deviations of a field that a step from the image may differ from the step's image
@@ -99,16 +100,18 @@ def _judge(element: Element, spaces: Spaces, halves: Sequence[_Half], first: Tra
     counts = compared[0].counts & compared[1].counts
     ends = any(half.held.terminated is not None and bool(half.held.terminated.any()) for half in halves)
     pays = any(bool(half.held.reward.any()) for half in halves)
+    masks = [half.held.action_mask for half in halves]
+    forbids = any(mask is not None and not bool(mask.all()) for mask in masks)
     verdicts = []
     for name in halves[0].fields:
         alone, planted, *others = (
             torch.cat(parts) for parts in zip(*(one.fields[name] for one in compared), strict=True)
         )
         still = all(float(half.spread[half.fields[name]].sum()) < STILL**2 for half in halves)
-        # that it never changes is its law where it is seen; that of rewards and ends which never came is unknown
-        of_nothing = concluded(name, 0.0, 0.0, broken=False, p_value=float(may_come(name, ends, pays)))
+        # that it never changes is its law where it is seen; that of what never came is unknown
+        of_nothing = concluded(name, 0.0, 0.0, broken=False, p_value=float(may_come(name, ends, pays, forbids)))
         verdicts.append(of_nothing if still else _judged(name, alone, planted[:, counts], others))
-    found = ElementVerdict(element.name, declared, tuple(verdicts))
+    found = ElementVerdict(element.name, declared, (*verdicts, *_unrecorded(spaces, halves[0].fields)))
     image = turned(first, transform)
     shift, preference = _shift(first.obs, image.obs), _shift(done(first, spaces), done(image, spaces))
     if shift > (_PREFERS if found.outcome == "broken" else _ELSEWHERE):
@@ -117,6 +120,14 @@ def _judge(element: Element, spaces: Spaces, halves: Sequence[_Half], first: Tra
         reason = f"the first actions differ from their image by {preference:.2f} s.d."
         return ElementVerdict(element.name, declared, (), reason)
     return found
+
+
+def _unrecorded(spaces: Spaces, recorded: Collection[str]) -> list[FieldVerdict]:
+    """Say that masks and ends of a task of which transitions hold nothing are not covered."""
+    flags = {"action mask": spaces.masks}
+    if isinstance(spaces, TaskSpec):
+        flags |= {"end": spaces.terminates, "alive": spaces.agents_end}
+    return [FieldVerdict(name, "not covered", 0.0, 0.0) for name, has in flags.items() if has and name not in recorded]
 
 
 def _judged(name: str, alone: Tensor, planted: Tensor, others: Sequence[Tensor]) -> FieldVerdict:
@@ -142,7 +153,8 @@ class _Half:
     """A predictor of one half of the episodes, and what it errs by on the other, which is `held`."""
 
     def __init__(self, spaces: Spaces, controls: Controls, fitted: Transitions, held: Transitions) -> None:
-        outputs, width = outputs_of(fitted), spaces.observation.width
+        parts = outputs_of(fitted)
+        outputs = torch.cat([*parts.values()], -1)
         self._width, self._controls, self.held = outputs.shape[-1], controls, held
         self._mean, self._deviation = outputs.mean((0, 1, 2)), outputs.flatten(0, 2).std(0)
         places = spaces.observation.slices().values()
@@ -155,10 +167,8 @@ class _Half:
         self._errors = (self._trust * self._here.said - self._here.true).square()
         self.spread = self._here.true.flatten(0, 2).var(0)
         self.fields = {f"obs.{name}": where for name, where in spaces.observation.slices().items()}
-        self.fields |= {"reward": slice(width, width + 1)}
-        masks = self._width - (fitted.terminated is not None)
-        self.fields |= {"action mask": slice(width + 1, masks)} if masks > width + 1 else {}
-        self.fields |= {"end": slice(masks, self._width)} if masks < self._width else {}
+        stops = accumulate(part.shape[-1] for part in parts.values())
+        self.fields |= {name: slice(*ends) for name, ends in zip([*parts][1:], pairwise(stops), strict=True)}
 
     @torch.no_grad()
     def compared(self, transform: Transform) -> _Compared:
@@ -198,7 +208,7 @@ class _Half:
 
         Squares and products are of standard deviations from the mean.
         """
-        outputs = outputs_of(data)
+        outputs = torch.cat([*outputs_of(data).values()], -1)
         centred = (outputs - self._mean) / self._deviation.clamp_min(STILL)
         return torch.cat([outputs, centred.square(), centred[..., : len(self._next)] * centred[..., self._next]], -1)
 
@@ -232,8 +242,7 @@ def _refuse_what_says_nothing(spaces: Spaces, data: Transitions) -> None:
     shapes = {"obs": seen, "action": (*lead, *width), "reward": lead, "next_obs": seen}
     if data.action_mask is not None and isinstance(spaces.action, Discrete):
         shapes["action_mask"] = (*lead, spaces.action.count)
-    if data.terminated is not None:
-        shapes["terminated"] = lead
+    shapes |= {name: lead for name in ("terminated", "alive") if getattr(data, name) is not None}
     for name, shape in shapes.items():
         found = tuple(getattr(data, name).shape)
         if found != shape or len(lead) != 3 or 0 in found[1:]:

@@ -17,6 +17,7 @@ Outcome = Literal["holds", "broken", "not covered"]
 RANK: dict[Outcome, int] = {"holds": 0, "not covered": 1, "broken": 2}  # of several outcomes the highest counts
 SIGNIFICANT = 6.0  # standard errors of a gap that is a breaking: of thousands of comparisons some reach 4
 NEGLIGIBLE = 1e-3  # gap against the field's spread below which a difference is rounding
+ENDS = frozenset({"end", "alive"})  # fields: of the episode, of agents
 LATE = "not tried, as the time was over"
 LEVEL = 0.05  # probability with which an element that is off by the tolerance may be said to hold, at most
 Named = TypeVar("Named", bound=Element | Shift)
@@ -79,9 +80,12 @@ def concluded(
     return FieldVerdict(field, outcome, gap, error, 1.0 if broken else p_value, share)
 
 
-def may_come(field: str, ends: bool, pays: bool) -> bool:
-    """Return whether a field that never changed may do so elsewhere: an end; a reward, unless it pays and play ends."""
-    return field == "end" or (field == "reward" and not (ends and pays))
+def may_come(field: str, ends: bool, pays: bool, forbids: bool) -> bool:
+    """Return whether a field that never changed may do so elsewhere.
+
+    An end may; so may a mask, unless it forbids some action, and a reward, unless it pays and play ends.
+    """
+    return field in ENDS or (field == "action mask" and not forbids) or (field == "reward" and not (ends and pays))
 
 
 def verdicts_of(

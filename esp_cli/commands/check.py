@@ -238,10 +238,9 @@ def print_elements(report: SymmetryReport, found: str) -> None:
     from esp_cli.checking.task import TOLERATED
     from esp_cli.checking.verdicts import LATE
 
-    rows: list[tuple[str, ...]] = [
-        (e.element, "yes" if e.declared else "no", e.outcome, f"{e.p_value:.1g}", _where(e)) for e in report.elements
-    ]
-    rows += [(name, "no", "not tried", "", told) for name, told in report.refused.items()]
+    tried = [(e, str(e.outcome), f"{e.p_value:.1g}") for e in report.elements]
+    told = [*tried, *((e, "not tried", "") for e in report.refused)]
+    rows = [(e.element, "yes" if e.declared else "no", result, p, _where(e)) for e, result, p in told]
     caption = (
         "gaps and standard errors in standard deviations of the field; p: how likely so small a gap is where a field "
         f"is off by {TOLERATED[report.method]} or more"

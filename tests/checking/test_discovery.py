@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -320,12 +321,21 @@ def test_what_is_discovered_needs_no_declaration_and_other_transforms_do() -> No
         build_learner(resolve_config("navigation", overrides={"prior.transforms": "discovered:rot45"}))
 
 
+@pytest.mark.parametrize(("declared", "trust"), [("d4*agents", "full"), ("c1", "measured")])
+def test_what_holds_and_nobody_declared_is_planned_as_measured(declared, trust, monkeypatch) -> None:
+    spec = replace(make("navigation", 1, [0]).spec, symmetry=declared, nearly="")
+    monkeypatch.setattr(measured, "_maker", lambda task: lambda num_envs, seeds: SimpleNamespace(spec=spec))
+    weights = dict.fromkeys(("rot90", "rot180"), 1.0)
+    config = resolve_config("navigation", overrides={"prior.kind": "auto", "prior.weights": weights})
+    assert measured.planned(config).prior.trust == trust
+
+
 def test_a_task_is_searched_once_however_many_runs_ask(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 
     def found(make_worlds):
         asked.append(make_worlds)
-        return SymmetryReport("navigation", "paired states", "d4", "c4", "discovered:c4", (), {})
+        return SymmetryReport("navigation", "paired states", "d4", "c4", "discovered:c4", (), ())
 
     measured._discovered.cache_clear()
     monkeypatch.setattr(measured, "check_symmetry", found)

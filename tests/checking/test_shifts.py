@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from esp_cli.checking import check_symmetry
-from esp_cli.checking.shifting import Shift
+from esp_cli.checking.shifting import Shift, leaves
 from esp_envs import Discrete, Field, Kind, Spaces, UserError, layout, make
 
 
@@ -19,6 +19,14 @@ def test_places_alone_are_shifted_by_hand():
     spec = Spaces(num_agents=1, observation=seen, state=seen, action=moves, symmetry="d1")
     shifted = Shift(spec).obs(torch.zeros(12)).tolist()
     assert shifted == pytest.approx([0, 0, 1.2361, -0.7639] * 3)
+
+
+def test_a_row_is_taken_apart_by_hand():
+    parts = (Field("place", Kind.VECTOR), Field("size", Kind.SCALAR, 2))
+    fields = (Field("speed", Kind.SCALAR), Field("things", Kind.RECORD, 2, parts=parts), Field("goal", Kind.VECTOR))
+    found = [(field.name, where.start, where.stop) for field, where in leaves(fields)]
+    things = [("place", 1, 3), ("size", 3, 5), ("place", 5, 7), ("size", 7, 9)]
+    assert found == [("speed", 0, 1), *things, ("goal", 9, 11)]
 
 
 def test_a_declared_shift_is_tried_unasked_and_holds():

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 from esp_cli.checking import Transitions, candidates, check_recorded, check_transitions, collect, named
-from esp_cli.checking.candidates import is_declared, refused
+from esp_cli.checking.candidates import is_declared, refused, turns_freely
 from esp_cli.symmetry import parse_elements
 from esp_envs import make
 from esp_envs.mpe.task import FORCE
-from esp_envs.spec import Discrete, Field, Items, Kind, Spaces, discrete_moves, layout
+from esp_envs.spec import Continuous, Discrete, Field, Items, Kind, Spaces, discrete_moves, layout
 from tests.checking.faults import Fault, as_scalars, declared, first_counts_more, wind, with_fault
 
 CONTINUOUS = {"actions": "continuous"}
@@ -196,9 +196,32 @@ def test_what_no_action_carries_is_not_tried() -> None:
     assert "rot45" not in {element.name for element in candidates(spec)}
     with pytest.raises(ValueError, match="no transform can be tried on navigation: action 'left' turned by 45"):
         candidates(spec, "rot45")
+    told = "action 'left' turned by 45 degrees is no action"
     left_out = refused(spec, "c8")
-    assert list(left_out) == ["rot45", "rot135", "rot225", "rot315"]
-    assert left_out["rot45"] == "action 'left' turned by 45 degrees is no action"
+    assert [one.element for one in left_out] == ["rot45", "rot135", "rot225", "rot315"]
+    assert (left_out[0].reason, {one.declared for one in left_out}) == (told, {False})
+    assert refused(spec) == ()
+    declared = refused(replace(spec, symmetry="c8"))
+    assert [(one.element, one.declared) for one in declared] == [(one.element, True) for one in left_out]
+
+
+def test_a_declared_element_that_no_action_carries_is_not_covered() -> None:
+    env = make("navigation", 64, [0])
+    spec, data = replace(env.spec, symmetry="c8"), collect(env, 64)
+    for asked, holds in (("rot90", True), ("rot90,rot45", False)):
+        report = check_recorded("data", spec, data, asked)
+        assert "rot45" not in report.broken
+        assert ("rot45" in report.uncovered) is not holds
+
+
+@pytest.mark.parametrize(("rays", "group"), [(0, "o2"), (120, "d120")])
+def test_a_turn_by_some_rays_stands_for_no_other_angle(rays: int, group: str) -> None:
+    force = layout(Field("force", Kind.VECTOR))
+    seen = layout(Field("goal", Kind.VECTOR), *([Field("ring", Kind.RING, rays=rays)] if rays else []))
+    spaces = Spaces(num_agents=1, observation=seen, state=seen, action=Continuous(force), symmetry="c1")
+    tried = candidates(spaces)
+    assert "rot57" in {element.name for element in tried}
+    assert named(tried, tried, freely=turns_freely(spaces)) == (group, f"discovered:{group}")
 
 
 def test_what_moves_no_number_is_not_tried() -> None:

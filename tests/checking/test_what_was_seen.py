@@ -6,10 +6,12 @@ from typing import ClassVar
 import pytest
 import torch
 
-from esp_cli.checking import check_symmetry
+from esp_cli.checking import check_symmetry, check_transitions, collect, paired
+from esp_cli.checking.verdicts import LATE, Late
+from esp_cli.symmetry import parse_elements
 from esp_envs import BatchedTask, Field, Kind, generators_for, layout
 from esp_envs.settings import TaskSettings
-from esp_envs.spec import Continuous, Items, TaskSpec
+from esp_envs.spec import Continuous, Items, TaskSpec, discrete_moves
 
 
 class Settings(TaskSettings):
@@ -123,6 +125,42 @@ class End(NoEnd):
         return world["position"][:, :, 0, 0] > 0.9
 
 
+class Leaving(Point):  # an agent that ends where play never goes
+    far = 30.0
+
+    def _describe(self):
+        return replace(super()._describe(), agents_end=True)
+
+    def _living(self, world):
+        return world["position"][..., 0] < self.far
+
+
+class LeavingSoon(Leaving):
+    far = 0.5
+
+
+class Masked(Point):  # where a move is forbidden, as play never goes there
+    def _describe(self):
+        return replace(super()._describe(), action=discrete_moves(4), masks=True)
+
+    def _allow(self, world):
+        return (world["position"][..., :1] < 30).expand(-1, -1, -1, 4)
+
+    def moved(self, world, action):
+        return self.speed * torch.tensor(self.spec.action.points)[action]
+
+
+class Walled(Point):  # in the east, further out than play goes; the place is a part of a record
+    def _describe(self):
+        thing = Field("position", Kind.RECORD, parts=(Field("place", Kind.VECTOR),))
+        return replace(super()._describe(), observation=layout(thing), state=layout(thing))
+
+    def _advance(self, world, action):
+        paid = super()._advance(world, action)
+        world["position"] = torch.minimum(world["position"], torch.tensor([4.0, torch.inf]))
+        return paid
+
+
 class Seldom(Point):  # nearly all reward is in one step of five hundred
     def paid(self, place):
         near = (place - torch.tensor([0.7, 0.0])).norm(dim=-1) < 0.05
@@ -161,6 +199,12 @@ class PaidByGust(Point):  # for the gust that it was moved by, up; each number b
         return self.gust[:, :, 0, 1]
 
 
+class Skewed(Point):  # gusts of mean 0 along y, seldom and strong up, often and weak down
+    def moved(self, world, action):
+        up = -((self.draw(1, 1) + 1) / 2).clamp_min(1e-7).log() - 1
+        return 0.1 * action + 0.3 * torch.cat([self.draw(1, 1), up], -1)
+
+
 class Meadow(Point):  # in a field of 100 m, with small gusts
     size = 50.0
 
@@ -191,6 +235,7 @@ def test_a_breaking_is_found_that_builds_up_later_or_is_small_beside_other_numbe
         (WindyByChance, "rot90", "flip-x", "obs.position"),
         (Street, "flip-x", "flip-diagonal", "obs.position"),
         (PaidByGust, "flip-x", "flip-y", "fields together"),
+        (Skewed, "flip-x", "flip-y", "obs.position"),
     ],
 )
 def test_breakings_by_chance_or_before_an_end_are_found(task, element, mirror, field):
@@ -244,15 +289,39 @@ def test_an_element_that_moved_nothing_is_not_covered():
     assert (found.outcome, found.reason) == ("not covered", "it moves nothing in the states that play visits")
 
 
-@pytest.mark.parametrize(("task", "field"), [(Cost, "reward"), (NoEnd, "end")])
+@pytest.mark.parametrize(
+    ("task", "field"), [(Cost, "reward"), (NoEnd, "end"), (Leaving, "alive"), (Masked, "action mask")]
+)
 @pytest.mark.parametrize("from_transitions", [False, True])
 def test_rewards_and_ends_that_never_came_are_not_covered(task, field, from_transitions):
     assert verdict(task, "rot90", from_transitions) == ("not covered", {field})
 
 
-def test_transitions_show_ends():
-    assert verdict(End, "rot90", from_transitions=True) == ("broken", {"end"})
-    assert verdict(End, "flip-x", from_transitions=True)[0] == "holds"
+@pytest.mark.parametrize(("task", "field"), [(End, "end"), (LeavingSoon, "alive")])
+@pytest.mark.parametrize("from_transitions", [False, True])
+def test_ends_of_episodes_and_agents_are_seen_and_not_covered_where_transitions_leave_them_out(
+    task, field, from_transitions
+):
+    assert verdict(task, "rot180", from_transitions) == ("broken", {field})
+    assert verdict(task, "flip-x", from_transitions)[0] == "holds"
+    env = task(Settings(), 128, generators_for([0]))
+    data = replace(collect(env, 128), terminated=None, alive=None)
+    (found,) = check_transitions(env.spec, data, parse_elements("flip-x", 1))
+    assert [one.field for one in found.fields if one.outcome == "not covered"] == [field]
+
+
+def test_what_breaks_further_out_is_not_covered_in_records_either():
+    assert verdict(Walled, "flip-y") == ("not covered", {"obs.position", "state.position"})
+    assert verdict(Walled, "flip-x")[0] == "holds"
+
+
+def test_where_the_time_is_over_before_later_steps_an_element_is_not_covered(monkeypatch):
+    def late(*_):
+        raise Late
+
+    monkeypatch.setattr(paired._Pairs, "broken_later", late)
+    (found,) = check_symmetry(lambda n, seeds: Point(Settings(), n, generators_for(seeds)), "rot90").elements
+    assert (found.outcome, found.reason) == ("not covered", LATE)
 
 
 def test_rewards_that_nearly_all_lie_in_the_rarest_hundredth_are_not_covered():
@@ -280,6 +349,11 @@ class Half(Goal):
         return super()._ended(world) & (world["position"][:, :, 0, 0] > 0)
 
 
+class Bonus(Goal):  # and is paid there, on one side
+    def paid(self, place):
+        return super().paid(place) + 5 * (place.norm(dim=-1) < 0.004) * (place[..., 0] > 0)
+
+
 class Way(NoEnd):  # where the pay leads, and nothing that gathers
     def paid(self, place):
         return place[..., 0]
@@ -292,6 +366,8 @@ def test_ends_that_play_does_not_reach_are_sought_where_things_gather_and_where_
     assert verdict(Goal, "rot90")[0] == "holds"
     assert verdict(Half, "rot90") == ("not covered", {"end"})
     assert verdict(Way, "flip-x")[0] == "holds"
+    assert verdict(Bonus, "flip-x")[0] == "holds"
+    assert verdict(Bonus, "rot90") == ("not covered", {"reward"})
 
 
 def test_a_gap_is_told_in_deviations_of_the_field_or_of_a_small_number_up_to_one():
