@@ -6,9 +6,11 @@ import contextlib
 import errno
 import math
 import os
+import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from html import escape
+from itertools import takewhile
 from pathlib import Path
 from unicodedata import category
 
@@ -176,3 +178,11 @@ def attempting(verb: str, path: str | os.PathLike[str]) -> Iterator[None]:
         if is_correctable(error):
             raise UserError(f"cannot {verb} {os.fspath(path)}: {error.strerror or error}") from None
         raise OSError(error.errno, error.strerror, os.fspath(path)) from None
+
+
+def said_once(conventions: Sequence[str]) -> str:
+    """Return conventions one after the other, with what all begin with said once: "esp: sum; mud 0.9; wind 0.3"."""
+    parts = [re.findall(r".+?[:,] ", f"{convention}, ") for convention in conventions]
+    shared = [each[0] for each in takewhile(lambda each: len(set(each)) == 1, zip(*parts, strict=False))]
+    texts = ["".join(shared), *("".join(own[len(shared) :]) for own in parts)]
+    return "; ".join(text.removesuffix(", ") for text in texts if text).replace(": ; ", ": ")

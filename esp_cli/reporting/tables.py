@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from itertools import takewhile, zip_longest
+from itertools import zip_longest
 from typing import TypeVar
 
 from pydantic import JsonValue
@@ -20,6 +20,7 @@ from esp_cli.files.formatting import (
     format_mean,
     format_p,
     format_span,
+    said_once,
 )
 from esp_cli.policies.statistics import Estimate, Interval, Passing, SeedSummary, median_steps, summarise
 from esp_cli.reporting.results import CellResult, CellSummary, Gap, Results, floats
@@ -89,17 +90,9 @@ def returns_table(results: Results) -> Table:
     seeds = format_span({len(cell.seeds) for cell in results.cells})
     episodes = format_span({cell.episodes or results.episodes for cell in results.cells})
     caption = f"Mean ± standard error over {seeds} seeds of the {results.mode} return, {episodes} episodes a seed."
-    caption += f" Convention: {_told_once(conventions)}." if conventions else ""
+    caption += f" Convention: {said_once(conventions)}." if conventions else ""
     headings = ("", *([""] if has_paper else []), *(f"{column}>" for column in columns))
     return Table(results.title, headings, tuple(lines), caption)
-
-
-def _told_once(conventions: Sequence[str]) -> str:
-    """Return conventions one after the other, with what all begin with said once: "esp: sum; mud 0.9; wind 0.3"."""
-    parts = [re.findall(r".+?[:,] ", f"{convention}, ") for convention in conventions]
-    shared = [each[0] for each in takewhile(lambda each: len(set(each)) == 1, zip(*parts, strict=False))]
-    texts = ["".join(shared), *("".join(own[len(shared) :]) for own in parts)]
-    return "; ".join(text.removesuffix(", ") for text in texts if text).replace(": ; ", ": ")
 
 
 def comparison_table(results: Results) -> Table:

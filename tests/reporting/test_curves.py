@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from esp_cli.files.formatting import said_once
 from esp_cli.reporting.collect import RunCurve, collect_runs, read_curve
 from esp_cli.reporting.study_figures import draw_curves
-from esp_cli.reporting.tables import TABLES, _told_once
+from esp_cli.reporting.tables import TABLES
 from esp_cli.training.run_folder import RunFolder
 from esp_envs.errors import UserError
 from tests.training.runs import tiny_config, tiny_folder
@@ -208,11 +209,11 @@ def test_the_picture_shows_the_curves(tmp_path):
 
 
 def test_what_all_conventions_begin_with_is_said_once():
-    assert _told_once(["esp: sum, mud 0.9", "esp: sum, wind 0.3"]) == "esp: sum; mud 0.9; wind 0.3"
-    assert _told_once(["esp: sum, mud 0.9", "esp: mean"]) == "esp: sum, mud 0.9; mean"
-    assert _told_once(["esp: sum", "esp: sum, mud 0.9", "esp: sum, wind 0.3"]) == "esp: sum; mud 0.9; wind 0.3"
+    assert said_once(["esp: sum, mud 0.9", "esp: sum, wind 0.3"]) == "esp: sum; mud 0.9; wind 0.3"
+    assert said_once(["esp: sum, mud 0.9", "esp: mean"]) == "esp: sum, mud 0.9; mean"
+    assert said_once(["esp: sum", "esp: sum, mud 0.9", "esp: sum, wind 0.3"]) == "esp: sum; mud 0.9; wind 0.3"
     for unlike in (["sum, mud 0.9"], ["sum", "mean, mud 0.9"], ["sum, mud 0.9", "mean, mud 0.9"]):
-        assert _told_once(unlike) == "; ".join(unlike)
+        assert said_once(unlike) == "; ".join(unlike)
 
 
 def test_every_table_compares_at_the_last_step_that_all_runs_reached_and_says_where_each_stands():
