@@ -17,6 +17,7 @@ from unicodedata import category
 from esp_envs.errors import UserError
 
 NOTHING = "-"
+_MARKUP = re.compile(r"[\\`*<|]|\](?=\()")
 
 
 def escaped(text: str) -> str:
@@ -186,3 +187,8 @@ def said_once(conventions: Sequence[str]) -> str:
     shared = [each[0] for each in takewhile(lambda each: len(set(each)) == 1, zip(*parts, strict=False))]
     texts = ["".join(shared), *("".join(own[len(shared) :]) for own in parts)]
     return "; ".join(text.removesuffix(", ") for text in texts if text).replace(": ; ", ": ")
+
+
+def markdown_text(text: str) -> str:
+    """Return a text that Markdown shows as it is, in a cell of a table too."""
+    return _MARKUP.sub(r"\\\g<0>", " ".join(text.splitlines()))

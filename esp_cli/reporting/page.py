@@ -20,7 +20,7 @@ from jinja2 import Environment, FileSystemLoader, Template
 from esp_cli.defaults import __version__
 from esp_cli.drawing.draw import Request, draw
 from esp_cli.files.documents import encode
-from esp_cli.files.formatting import escaped, format_count, format_interval, format_mean, format_p
+from esp_cli.files.formatting import escaped, format_count, format_interval, format_mean, format_p, markdown_text
 from esp_cli.files.opening import read_regular
 from esp_cli.files.writing import replace_file
 from esp_cli.policies.loading import TrainedPolicy
@@ -29,7 +29,7 @@ from esp_cli.reporting.collect import Material
 from esp_cli.reporting.figures import Style
 from esp_cli.reporting.results import RESULTS_FORMAT, CellResult, Results, Side
 from esp_cli.reporting.study_figures import draw_curves, draw_variants
-from esp_cli.reporting.tables import NOT_RUN, all_tables, markdown_text
+from esp_cli.reporting.tables import NOT_RUN, all_tables
 from esp_cli.studies.kinds import kind_of
 from esp_cli.training.folder_names import POLICY
 from esp_envs.errors import UserError

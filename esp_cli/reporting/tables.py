@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import zip_longest
@@ -20,6 +19,7 @@ from esp_cli.files.formatting import (
     format_mean,
     format_p,
     format_span,
+    markdown_text,
     said_once,
 )
 from esp_cli.policies.statistics import Estimate, Interval, Passing, SeedSummary, median_steps, summarise
@@ -29,7 +29,6 @@ from esp_cli.studies.kinds import kind_of
 NOT_RUN, _STOPPED = "not run", "every seed stopped"
 AHEAD = {"ahead": "yes", "behind": "no", "level": "not told apart", "blind": "both below blind", None: NOTHING}
 _LEADER = {"first": "ours", "second": "paper", "neither": "not told apart", None: NOTHING}
-_MARKUP = re.compile(r"[\\`*<|]|\](?=\()")
 _BY_INTERVALS = "Ahead: the 95 % interval of the difference lies above 0."
 _BY_RANKS = "Ahead: by the rank-sum test at 5 %, with Holm's correction for the comparisons of a panel."
 _SHARES = ("share of reference run>", "ratio of median steps>")
@@ -54,11 +53,6 @@ class Table:
         first, *others = ([markdown_text(cell) for cell in row] for row in (names, *self.rows))
         lines = [f"| {' | '.join(cells)} |" for cells in (first, rule, *others)]
         return "\n".join([*lines, *(["", markdown_text(self.caption)] if self.caption else [])])
-
-
-def markdown_text(text: str) -> str:
-    """Return a text that Markdown shows as it is, in a cell of a table too."""
-    return _MARKUP.sub(r"\\\g<0>", " ".join(text.splitlines()))
 
 
 def all_tables(results: Results) -> list[Table]:

@@ -10,9 +10,10 @@ import pytest
 from PIL import Image
 
 from esp_cli.drawing.films import write_gif
+from esp_cli.files.formatting import markdown_text
 from esp_cli.reporting.collect import Material, collect_study
 from esp_cli.reporting.page import FILM, draw_films, write_report
-from esp_cli.reporting.tables import Table, markdown_text
+from esp_cli.reporting.tables import Table
 from esp_cli.training.folder_names import POLICY
 from esp_envs.base import Environment
 from esp_envs.registry import task_class
