@@ -380,7 +380,7 @@ IDLE = [
 ]
 
 
-@pytest.mark.parametrize(("settings", "idle"), IDLE, ids=str)
+@pytest.mark.parametrize(("settings", "idle"), IDLE)
 def test_settings_that_change_nothing_are_named(settings, idle: set[str]) -> None:
     others = {"obstacle_radius_m": 0.04, "neighbours": 9, "sight": "nearness", "collision_penalty": 0.9}
     others |= {"penalty_radius_m": 1.9, "arena_m": 2.5}
