@@ -201,9 +201,11 @@ def weights_to_start(source: str | os.PathLike[str], learner: Learner) -> tuple[
 
 
 def _seen_in_one(was: list[TaskSpec], now: list[TaskSpec]) -> list[str]:
-    """Return the families that a role sees in one of two specs alone."""
+    """Return the families that a role sees in one of two specs alone, if what it sees in the other is the rest."""
     sets = [[{family.name for family in role.observation.families} for role in roles] for roles in (was, now)]
-    return sorted({name for one, other in zip(*sets, strict=True) for name in one ^ other})
+    pairs = list(zip(*sets, strict=True))
+    nested = all(one <= other or other <= one for one, other in pairs)
+    return sorted({name for one, other in pairs for name in one ^ other}) if nested else []
 
 
 def _untrained(config: RunConfig, spec: TaskSpec) -> Policy:

@@ -83,9 +83,9 @@ def dots(
         for index, (name, value) in enumerate((anchors or {}).items()):
             if low <= value <= high:
                 dashes = _LINE_STYLES[(index + 1) % len(_LINE_STYLES)]
-                axes.axvline(value, linestyle=dashes, color="#777777", linewidth=1.2, label=f"{name} {value:.4g}")
+                axes.axvline(value, linestyle=dashes, color="#777777", linewidth=1.2, label=f"{name} {round(value, 2):g}")
             else:
-                axes.plot([], [], " ", label=f"{name} {value:.4g} (out of view)")
+                axes.plot([], [], " ", label=f"{name} {round(value, 2):g} (out of view)")
         axes.set_xlim(low, high)
         axes.xaxis.set_major_locator(MaxNLocator(nbins=8))
         axes.set_xlabel("\n".join(filter(None, (xlabel, caption(counts)))))

@@ -52,9 +52,8 @@ def plan(name: str, request: Request) -> Study:
 def planned_cells(cells: Iterable[Cell], request: Request) -> tuple[Cell, ...]:
     """Return what is run where these cells are asked for."""
 
-    def given(config: RunConfig) -> dict[str, object]:
-        own = {k: v for k, v in request.overrides.items() if concerns(k, config.task, config.algorithm)}
-        return {"preset": request.preset, **own}
+    def given(c: RunConfig) -> tuple[str, ...]:
+        return tuple(task_setting(k, c.task) for k in request.overrides if concerns(k, c.task, c.algorithm))
 
     return tuple(
         cell.model_copy(update={"config": planned(cell.config), "given": given(cell.config)}) for cell in cells

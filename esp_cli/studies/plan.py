@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field, JsonValue
+from pydantic import Field
 
 from esp_cli.defaults import __version__
 from esp_cli.files.documents import DocumentFormat, Strict
@@ -21,7 +21,7 @@ class Cell(Strict):
     reference: str | None = None  # name of the cell that it is compared with; None for such a cell itself
     # place of the paper's number, see `paper.reported`; None where there is none that compares
     paper: tuple[str, ...] | None = None
-    given: dict[str, JsonValue] | None = None  # preset and settings that the user gave for it; None where unknown
+    given: tuple[str, ...] | None = None  # dotted names of the settings that the user gave for it; None: unknown
 
 
 class Study(Strict):

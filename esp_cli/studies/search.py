@@ -58,15 +58,15 @@ class Trials(StudyFolder):
         Where those that judge are kept, all of a panel have equally many trials; else a search may grow alone.
         """
         if StudyFolder.is_one(path / FRESH) and cls.is_one(path):
-            there, judged = cls.open(path).study.cells, StudyFolder.open(path / FRESH)
-            done = {cell.name for cell in judged.study.cells}
+            there, done = cls.open(path).study.cells, {c.name for c in StudyFolder.open(path / FRESH).study.cells}
             for panel in dict.fromkeys(cell.panel for cell in study.cells):
                 asked, old = (_draws(cells, panel) for cells in (study.cells, there))
                 budget = min((len(own) for name, own in old.items() if not keep or name in done), default=0)
+                alike = all(len(own) == budget or own == old.get(name) for name, own in asked.items())
                 grown = all(own <= asked.get(name, set()) for name, own in old.items())
-                if budget and not (all(len(own) == budget for own in asked.values()) if keep else grown):
+                if budget and not (alike if keep else grown):
                     raise UserError(
-                        f"{judged.path} has judged trials on {panel}, {budget} each; keep its --budget"
+                        f"{path} has trials on {panel}, {budget} each, and {FRESH} judges them; keep its --budget"
                         f"{'' if keep else ' or more, and all its kinds of --prior'}, or choose another --out"
                     )
         return super().planned(path, study)
@@ -161,7 +161,8 @@ class Search(ABC):
             known = validate(Scores, parse_object(read_regular(file, MAX_DOCUMENT_BYTES) or b"", "text"))
             if all(one == other for one, other in zip(known.draws, found.draws, strict=False)):
                 draws = max(known.draws, found.draws, key=len)
-                found = Scores(draws=draws, seeds=found.seeds, scores=known.scores | found.scores)
+                earlier = {name: own for name, own in known.scores.items() if name not in map(": ".join, scores)}
+                found = Scores(draws=draws, seeds=found.seeds, scores=earlier | found.scores)
         replace_file(file, (found.model_dump_json(indent=1) + "\n").encode())
 
     def _judged(self, trials: Trials, best: Mapping[Candidate, int]) -> Study:

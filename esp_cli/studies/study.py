@@ -162,14 +162,16 @@ class StudyFolder:
     @staticmethod
     def _refuse_unlike(path: Path, new: Cell, old: Cell) -> None:
         """Refuse a run beside one for which the user gave other settings, since a table compares the two."""
-        if new.given is None or old.given is None or new.given == old.given:
+        if new.given is None or old.given is None:
             return
-        name = next(name for name in {**old.given, **new.given} if old.given.get(name) != new.given.get(name))
-        how = f"with {name} {old.given[name]}" if name in old.given else f"without {name}"
-        raise UserError(
-            f"{old.name} in {path} was planned {how}, and its table would compare it with "
-            f"{new.name}; give both the same --set and --preset, or choose another --out"
-        )
+        idle = new.config.without_effect() | old.config.without_effect()
+        ours, theirs = ({"preset": cell.config.preset, **cell.config.by_name()} for cell in (new, old))
+        for name in ("preset", *sorted({*new.given, *old.given} - idle)):
+            if ours.get(name) != theirs.get(name):
+                raise UserError(
+                    f"{old.name} in {path} has {name} {theirs.get(name)}, and a table would compare it with "
+                    f"{new.name}, which has {ours.get(name)}; give both the same, or choose another --out"
+                )
 
     def _refuse_old_rules(self, cell: Cell) -> None:
         """Refuse a finished run of an earlier version of its task, which other runs are not to stand beside."""

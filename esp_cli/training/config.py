@@ -91,6 +91,11 @@ class RunConfig(Strict):
         }
         return frozenset(f"{section}.{name}" for section, names in idle.items() for name in names)
 
+    def by_name(self) -> dict[str, Any]:
+        """Return all settings by their dotted names, as `--set` takes them."""
+        stored, sections = self.model_dump(mode="json"), {self.algorithm: "algorithm_settings"} | SECTIONS
+        return {f"{section}.{name}": value for section, key in sections.items() for name, value in stored[key].items()}
+
     def own_words(self, *others: RunConfig) -> list[str]:
         """Return the options that name code of the user in a command about runs, each once: ["--task", "mine:Task"]."""
         runs = (self, *others)

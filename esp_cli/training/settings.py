@@ -196,9 +196,7 @@ def _of_run(path: Path, config: RunConfig) -> ConfigFile:
     choices = {name: stored[name] for name in CHOICES if name != "init_from"}
     if config.init_from is not None:
         choices["init_from"] = config.init_from.source
-    sections = {config.algorithm: "algorithm_settings"} | SECTIONS
-    settings = {f"{section}.{name}": value for section, key in sections.items() for name, value in stored[key].items()}
-    return ConfigFile(path, choices, settings, config)
+    return ConfigFile(path, choices, config.by_name(), config)
 
 
 def parse_config(data: object, source: Path, writer: object = __version__) -> RunConfig:

@@ -46,7 +46,7 @@ def test_a_dry_run_in_a_folder_counts_what_is_left(tmp_path: Path) -> None:
         write_run(fresh, cell, [[-1.0] * 4], [-1.0] * 4)
     found = json.loads(esp(*words).stdout)
     assert ([run["status"] for run in found["runs"]], found["seconds"]) == (["finished"] * 4, 0)
-    assert "has judged trials on navigation, 60k, 2 each" in refused(*words, "--budget", "3")
+    assert "has trials on navigation, 60k, 2 each, and" in refused(*words, "--budget", "3")
 
 
 @pytest.mark.parametrize(
@@ -89,7 +89,10 @@ def test_a_benchmark_that_is_killed_goes_on_and_ends_in_a_report(tmp_path: Path)
     assert (out / "trials.json").read_bytes() == (alone / "trials.json").read_bytes()
     assert f"next: esp report {alone / 'fresh'}" in told.stderr
     grown = refused(*words, "--budget", "3", "--out", out)
-    assert "has judged trials on navigation, 450, 2 each; keep its --budget, or choose another --out" in grown
+    assert (
+        "has trials on navigation, 450, 2 each, and fresh judges them; keep its --budget, or choose another --out"
+        in grown
+    )
     document = json.loads(esp(*words, "--out", out, "--json", "-").stdout)
     assert [cell["variant"] for cell in document["cells"]] == ["plain", "ESP"]
     assert all({"early", "area_under_curve", "parameters", "seconds"} <= cell.keys() for cell in document["cells"])

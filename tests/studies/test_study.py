@@ -71,20 +71,32 @@ def test_a_run_is_refused_beside_one_for_which_other_settings_were_given(tmp_pat
     def planned(**choice):
         return StudyFolder.create(tmp_path / "s", small_study("ablate-prior", **choice))
 
-    planned(variants=("plain",), overrides=TINY | {"mappo.gamma": 0.5})
-    for overrides, told in ((TINY, "with mappo.gamma 0.5"), (TINY | {"mappo.gamma": 0.6}, "with mappo.gamma 0.5")):
-        with pytest.raises(UserError, match=f"mappo-plain in .* was planned {told}, and its table would compare"):
+    planned(variants=("plain",), overrides=TINY | {"mappo.gamma": 0.5, "navigation.wind": 0.1})
+    known = TINY | {"mappo.gamma": 0.5, "task.wind": 0.1}
+    for overrides, told in (
+        (
+            TINY | {"task.wind": 0.1},
+            r"has mappo\.gamma 0\.5, and a table would compare .*-esp, which has 0\.\d+;",
+        ),
+        (known | {"mappo.gamma": 0.6}, r"has mappo\.gamma 0\.5, .* which has 0\.6; give both the same, or"),
+        (known | {"mappo.gae_lambda": 0.5}, r"has mappo\.gae_lambda 0\.\d+, .* which has 0\.5;"),
+    ):
+        with pytest.raises(UserError, match=told):
             planned(variants=("ESP",), overrides=overrides)
-    with pytest.raises(UserError, match=r"was planned without mappo\.gae_lambda"):
-        planned(variants=("ESP",), overrides=TINY | {"mappo.gamma": 0.5, "mappo.gae_lambda": 0.5})
+    gae = small_study("ablate-prior", overrides=TINY).cells[0].config.algorithm_settings["gae_lambda"]
+    same = known | {"mappo.gae_lambda": gae, "prior.consistency_coef": 0.25, "network.hidden": (8, 8)}
+    assert planned(variants=("plain",), overrides=known | {"network.hidden": (8, 8)}, steps=((None, 300),))
+    assert len(planned(variants=("ESP",), overrides=same, steps=((None, 300),)).study.cells) == 3, (
+        "is idle, or the same"
+    )
     folder = planned(tasks=("predator-prey",), overrides=TINY)
-    assert len(folder.study.cells) == 3, "whose table compares them with no run of navigation"
+    assert len(folder.study.cells) == 5, "whose table compares them with no run of navigation"
     unknown = [cell.model_copy(update={"given": None}) for cell in folder.study.cells]
     STUDY_FORMAT.write(
         folder.path / "study.json",
         {**folder.study.model_dump(mode="json"), "cells": [c.model_dump(mode="json") for c in unknown]},
     )
-    assert len(planned(variants=("ESP",), overrides=TINY).study.cells) == 4, "planned by an earlier version"
+    assert len(planned(variants=("ESP",), overrides=TINY).study.cells) == 6, "planned by an earlier version"
 
 
 @pytest.mark.parametrize(

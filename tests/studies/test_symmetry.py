@@ -168,7 +168,7 @@ def test_what_is_judged_gets_no_further_trials_but_other_methods_do(tmp_path: Pa
     judged = asked.judged(write_trials(tmp_path / "s", asked, {}))
     Trials.create(tmp_path / "s", benchmark(budget=4, variants=("plain",)).trials)
     StudyFolder.create(tmp_path / "s" / "fresh", judged)
-    judged_by_3 = "fresh has judged trials on navigation, 60k, 3 each; keep its --budget, or"
+    judged_by_3 = "has trials on navigation, 60k, 3 each, and fresh judges them; keep its --budget, or"
     for more in ({"budget": 4}, {"budget": 2}, {"budget": 2, "variants": ("copies",)}):
         with pytest.raises(UserError, match=judged_by_3):
             Trials.create(tmp_path / "s", benchmark(**more).trials)

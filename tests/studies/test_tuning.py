@@ -256,7 +256,9 @@ def test_a_longer_search_goes_on_in_its_folder_and_one_in_another_space_does_not
     StudyFolder.create(tmp_path / "s" / "fresh", asked.judged(write_trials(tmp_path / "s", asked, {})), keep=False)
     assert len(Trials.planned(tmp_path / "s", tuning(budget=6).trials, keep=False)[0].study.cells) == 12
     for fewer in ({"budget": 4}, {"budget": 5, "priors": ("esp",)}):
-        with pytest.raises(UserError, match="5 each; keep its --budget or more, and all its kinds of --prior"):
+        with pytest.raises(
+            UserError, match="5 each, and fresh judges them; keep its --budget or more, and all its kinds of --prior"
+        ):
             Trials.planned(tmp_path / "s", tuning(**fewer).trials, keep=False)
     other = tuning(space={"mappo.gamma": Dimension(low=0.5, high=0.6)})
     with pytest.raises(UserError, match=r"holds another study .esp-001 has other seeds or settings"):
