@@ -87,14 +87,15 @@ class _Judge:
         states, actions = (torch.cat(part, 1) for part in zip(*moments, strict=True))
         self._visited = moments if slow else [(states, actions)]
         self._some = [(state[:, ::_SOME], action[:, ::_SOME]) for state, action in self._visited]
+        self._ending = cache(self._sought)
 
     def __call__(self, element: Element | Shift) -> ElementVerdict:
         if self._quick and (found := self._fewer.judge(element)).outcome == "broken":
             return found
         found = self._everywhere.judge(element)
-        unseen = {f.field for f in found.fields if f.outcome != "holds"}
-        if found.outcome == "not covered" and unseen and unseen <= ENDS and self._ending is not None:
-            found = self._as_at_an_end(found, self._ending.judge(element))
+        unseen = frozenset(f.field for f in found.fields if f.outcome != "holds")
+        if found.outcome == "not covered" and unseen and unseen <= ENDS and (ending := self._ending(unseen)):
+            found = self._as_at_an_end(found, ending.judge(element))
         if found.outcome == "holds" and self._further is not None:
             found = self._as_beyond(found, self._further.judge(element), "further out", self._few)
         return self._as_later(element, found) if found.outcome == "holds" else found
@@ -111,9 +112,8 @@ class _Judge:
     def _further(self) -> _Pairs | None:
         return self._tried(lambda: [(stretched(state, self._spec.state), action) for state, action in self._some])
 
-    @cached_property
-    def _ending(self) -> _Pairs | None:
-        return self._tried(lambda: [seek_end(self._make, self._moments[0][0], self._later, self._until)])
+    def _sought(self, unseen: frozenset[str]) -> _Pairs | None:
+        return self._tried(lambda: [seek_end(self._make, self._moments[0][0], self._later, self._until, unseen)])
 
     @cached_property
     def _onwards(self) -> _Pairs | None:

@@ -370,6 +370,31 @@ def test_ends_that_play_does_not_reach_are_sought_where_things_gather_and_where_
     assert verdict(Bonus, "rot90") == ("not covered", {"reward"})
 
 
+class Fenced(Way):  # where agents leave, in play
+    beside = 0.95
+
+    def _describe(self):
+        return replace(super()._describe(), agents_end=True)
+
+    def _living(self, world):
+        return world["position"][..., 1].abs() < self.beside
+
+
+class FencedFarOff(Fenced):
+    beside = 1.4
+
+
+class FencedHalf(FencedFarOff):
+    def _ended(self, world):
+        return super()._ended(world) & (world["position"][:, :, 0, 1] > 0)
+
+
+def test_an_end_is_sought_beside_ends_of_agents():
+    assert verdict(Fenced, "flip-x")[0] == "holds"
+    assert verdict(FencedFarOff, "flip-x")[0] == "holds"
+    assert verdict(FencedHalf, "flip-x") == ("not covered", {"end"})
+
+
 def test_a_gap_is_told_in_deviations_of_the_field_or_of_a_small_number_up_to_one():
     for task, most in ((Slow, 1.0), (Point, 0.0)):
         (found,) = check_symmetry(lambda n, seeds, t=task: t(Settings(), n, generators_for(seeds)), "rot90").elements
