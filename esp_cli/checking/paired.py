@@ -94,8 +94,8 @@ class _Judge:
             return found
         found = self._everywhere.judge(element)
         unseen = frozenset(f.field for f in found.fields if f.outcome != "holds")
-        if found.outcome == "not covered" and unseen and unseen <= ENDS and (ending := self._ending(unseen)):
-            found = self._as_at_an_end(found, ending.judge(element))
+        if found.outcome == "not covered" and unseen & ENDS and unseen <= ENDS | {"action mask"}:
+            found = self._as_at_an_end(element, found, unseen & ENDS)
         if found.outcome == "holds" and self._further is not None:
             found = self._as_beyond(found, self._further.judge(element), "further out", self._few)
         return self._as_later(element, found) if found.outcome == "holds" else found
@@ -133,10 +133,13 @@ class _Judge:
             return _Pairs(self._make, moments(), self._until, onwards)
         return None
 
-    def _as_at_an_end(self, found: ElementVerdict, near: ElementVerdict) -> ElementVerdict:
-        """Judge ends that did not come in play, and all that comes with them, where one was found."""
-        ends = {f.field: f for f in near.fields if f.field in ENDS and f.outcome == "holds"}
-        found = replace(found, fields=tuple(ends.get(f.field, f) for f in found.fields))
+    def _as_at_an_end(self, element: Element | Shift, found: ElementVerdict, unseen: frozenset[str]) -> ElementVerdict:
+        """Judge ends that did not come in play, and all that comes with them, as masks, where one was found."""
+        if (ending := self._ending(unseen)) is None:
+            return found
+        near = ending.judge(element)
+        held = {f.field: f for f in near.fields if f.outcome == "holds"}
+        found = replace(found, fields=tuple(f if f.outcome == "holds" else held.get(f.field, f) for f in found.fields))
         return self._as_beyond(found, near, "at an end", 0.0) if found.outcome == "holds" else found
 
     def _as_beyond(self, found: ElementVerdict, beyond: ElementVerdict, where: str, few: float) -> ElementVerdict:

@@ -395,6 +395,35 @@ def test_an_end_is_sought_beside_ends_of_agents():
     assert verdict(FencedHalf, "flip-x") == ("not covered", {"end"})
 
 
+class Gone(Masked):  # an agent that leaves where play seldom goes, and then may do nothing
+    speed = 0.0005
+
+    def _describe(self):
+        return replace(super()._describe(), agents_end=True)
+
+    def _living(self, world):
+        return world["position"].norm(dim=-1) > 0.004
+
+    def _allow(self, world):
+        return self._living(world).unsqueeze(-1).expand(-1, -1, -1, 4)
+
+
+class GoneUnmasked(Gone):  # and something is forbidden further out alone
+    def _allow(self, world):
+        return Masked._allow(self, world)
+
+
+class GoneHalf(Gone):
+    def _allow(self, world):
+        return super()._allow(world) | (world["position"][..., :1] > 0)
+
+
+def test_masks_that_follow_ends_of_agents_are_seen_at_a_sought_end():
+    assert verdict(Gone, "rot90")[0] == "holds"
+    assert verdict(GoneUnmasked, "rot90") == ("not covered", {"action mask"})
+    assert verdict(GoneHalf, "rot90") == ("not covered", {"action mask"})
+
+
 def test_a_gap_is_told_in_deviations_of_the_field_or_of_a_small_number_up_to_one():
     for task, most in ((Slow, 1.0), (Point, 0.0)):
         (found,) = check_symmetry(lambda n, seeds, t=task: t(Settings(), n, generators_for(seeds)), "rot90").elements
