@@ -24,7 +24,7 @@ from esp_cli.checking.comparison import (
     the_same,
 )
 from esp_cli.checking.shifting import Shift, Unmoved
-from esp_cli.checking.stepping import nudged, outcomes, played, seek_end, stretched, visit
+from esp_cli.checking.stepping import MOMENTS, nudged, outcomes, played, seek_end, stretched, visit
 from esp_cli.checking.verdicts import ENDS, ElementVerdict, FieldVerdict, Watch, may_come, verdicts_of
 from esp_cli.symmetry import Element, Transform, build_transform
 from esp_envs.promises import MakeWorlds
@@ -63,12 +63,13 @@ def check_paired(
     Of many elements, each is first tried in an eighth of the states: what is broken there is broken. What holds in all
     states that were visited is tried further out, too, where random play does not go: an element that is broken there
     is not covered. And it is tried in the steps that follow, in which clocks run and what no state holds builds up.
-    `until` and `spare` as in `verdicts_of`.
+    Short episodes are played several times, as chance takes many states. `until` and `spare` as in `verdicts_of`.
     """
     shown = make(1, [0]).spec
     most = _FEWEST_WORLDS if slow else _MOST_WORLDS
     worlds = max(_FEWEST_WORLDS, min(most, _NUMBERS // (shown.num_agents * shown.observation.width)))
-    visited = visit(make(worlds, [0]), watch, (until + time.monotonic()) / 2, early=slow)
+    env, rounds = make(worlds, [0]), 1 if slow else max(1, MOMENTS // shown.horizon)
+    visited = [one for _ in range(rounds) for one in visit(env, watch, (until + time.monotonic()) / 2, early=slow)]
     judge = _Judge(make, shown, visited, slow, until, len(elements) > _SOME)
     return verdicts_of(elements, judge, lambda element: is_declared(element, shown), watch, until, spare)
 

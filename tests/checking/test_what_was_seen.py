@@ -205,6 +205,11 @@ class Skewed(Point):  # gusts of mean 0 along y, seldom and strong up, often and
         return 0.1 * action + 0.3 * torch.cat([self.draw(1, 1), up], -1)
 
 
+class Coins(Point):  # one for x and one for y
+    def moved(self, world, action):
+        return 0.1 * action + 0.3 * self.draw(1, 2).sign()
+
+
 class Meadow(Point):  # in a field of 100 m, with small gusts
     size = 50.0
 
@@ -242,6 +247,13 @@ def test_breakings_by_chance_or_before_an_end_are_found(task, element, mirror, f
     outcome, fields = verdict(task, element)
     assert (outcome, field in fields) == ("broken", True)
     assert verdict(task, mirror)[0] == "holds"
+
+
+@pytest.mark.parametrize(("task", "outcome"), [(Coins, "holds"), (Street, "broken")])
+def test_an_episode_of_one_step_is_played_so_often_that_chance_is_judged(task, outcome):
+    make = lambda count, seeds: task(Settings(horizon=1), count, generators_for(seeds))  # noqa: E731
+    (found,) = check_symmetry(make, "flip-x").elements
+    assert found.outcome == outcome
 
 
 @pytest.mark.parametrize("task", [Point, Paid, Slow, Beside, Delayed, End, Meadow])
