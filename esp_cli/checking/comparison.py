@@ -17,7 +17,7 @@ a proof. And where a run from the images that meets the chance of X gives X itse
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from itertools import combinations, product
 
@@ -44,6 +44,7 @@ _SMALL = 0.01
 number would hide a small one beside it, and a large world slow steps."""
 _OF_GINI = math.pi**0.5 / 2  # standard deviations of normal chance in one of its mean difference
 _ULPS = 1e-6  # rounding of a number as a share of it, at least
+Distance = Callable[[Tensor], Tensor]  # of differences [M, numbers]
 Outcomes = dict[str, Tensor]  # what a step gives, by field: [M, numbers]
 
 
@@ -87,8 +88,8 @@ def beside_what_is_seen(name: str, sides: Sequence[Outcomes], near: Outcomes) ->
     rows, _ = _known(*(torch.cat([side[one] for one in names], 1) for side in (*sides, near)))
     tolerance = NEGLIGIBLE * rows[0].std(0).clamp_min(1e-6)
     is_clear = (_ROUNDINGS * (rows[0] - rows[-1]).abs() <= tolerance).all(1)
-    gaps = _gaps([side[is_clear] for side in rows[:-1]])
-    samples = _excess(lambda gap: (gap.abs() > tolerance).any(-1, keepdim=True).double(), *gaps)
+    clear = _halves([side[is_clear] for side in rows[:-1]])
+    samples = _excess(lambda gap: (gap.abs() > tolerance).any(-1, keepdim=True).double(), *clear)
     share, error = float(samples.mean()), float(samples.std()) / max(1, len(samples)) ** 0.5
     return FieldVerdict(name, "broken", share, error, share=share) if share > max(SIGNIFICANT * error, FEW) else None
 
@@ -107,15 +108,15 @@ def by_distances(
     pairs = ((sides[0][field][known], sides[-1][field][known], _before(field, sides[0], known)) for field in fields)
     each = [_units(*pair)[0] for pair in pairs]
     units, shares = torch.cat(each), torch.cat([torch.full_like(unit, len(unit) ** -0.5) for unit in each])
-    here, there, across = _gaps([side / units for side in rows])
+    here, there = _halves([side / units for side in rows])
     # of all numbers at once, since chance may tie them together
-    tests = [_excess(lambda gap: (gap * shares).norm(dim=-1, keepdim=True), here, there, across)]
+    tests = [_excess(lambda gap: (gap * shares).norm(dim=-1, keepdim=True), here, there)]
     if not together:
         # The second distance is bounded, so that rare large chance (a touch, a capture) hides no small constant fault.
         distances = (Tensor.abs, lambda gap: _BOUND * -torch.expm1(-gap.abs() / _BOUND))
-        tests += [_excess(distance, here, there, across) for distance in distances]
-        tests.append(across.mean(0))
-        tests.append((here.abs().mean(0) - there.abs().mean(0)) * _OF_GINI)
+        tests += [_excess(distance, here, there) for distance in distances]
+        tests.append(_over(lambda gap: gap, product(here, there)))
+        tests.append((_within(Tensor.abs, here) - _within(Tensor.abs, there)) * _OF_GINI)
     samples = torch.cat(tests, 1).double()
     if worlds is not None:
         _, worlds, counts = worlds[known].unique(return_inverse=True, return_counts=True)
@@ -126,7 +127,7 @@ def by_distances(
     tolerated[: 0 if together else 3] = TOLERATED**2  # the distances grow as the square of a shift
     chances = torch.special.ndtr((gaps - tolerated) / errors.clamp_min(1e-12))
     if worlds is None:
-        of_pairs = _covariances(here[0], there[0])
+        of_pairs = _covariances(here[0] - here[1], there[0] - there[1])
         gaps, errors = torch.cat([gaps, of_pairs[0]]), torch.cat([errors, of_pairs[1]])
     broken = (gaps > SIGNIFICANT * errors) & (gaps > NEGLIGIBLE)
     worst = int(torch.where(broken, gaps, gaps * (not broken.any()))[: None if broken.any() else len(chances)].argmax())
@@ -177,18 +178,26 @@ def _each_state(name: str, apart: Tensor, rounding: Tensor, scale: float, units:
     return concluded(name, gap, 0.0, bool(differ.any()), float(unclear > _UNCLEAR), share)
 
 
-def _gaps(runs: Sequence[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """Return differences of each two runs of the first half, of the second, and across halves: [pairs, M, D] each."""
-    sides = runs[: len(runs) // 2], runs[len(runs) // 2 :]
-    pairs = (*(combinations(side, 2) for side in sides), product(*sides))
-    first, second, across = (torch.stack([x - y for x, y in each]) for each in pairs)
-    return first, second, across
+def _halves(runs: Sequence[Tensor]) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
+    return runs[: len(runs) // 2], runs[len(runs) // 2 :]
 
 
-def _excess(distance: Callable[[Tensor], Tensor], first: Tensor, second: Tensor, across: Tensor) -> Tensor:
-    """Return by how much outcomes of the two sides lie further apart than those of one side [M, 1]; see `_gaps`."""
-    apart, own = distance(across).mean(0), distance(torch.cat([first, second])).mean(0)
-    return (apart - own).mean(1, keepdim=True)
+def _over(distance: Distance, pairs: Iterable[tuple[Tensor, Tensor]]) -> Tensor:
+    """Return the mean distance [M, ...] of pairs of runs, of which one difference at a time is in memory."""
+    total, count = torch.zeros(()), 0
+    for x, y in pairs:
+        total, count = total + distance(x - y), count + 1
+    return total / count
+
+
+def _within(distance: Distance, runs: Sequence[Tensor]) -> Tensor:
+    return _over(distance, combinations(runs, 2))
+
+
+def _excess(distance: Distance, here: Sequence[Tensor], there: Sequence[Tensor]) -> Tensor:
+    """Return by how much outcomes of the two sides lie further apart than those of one side [M, 1]."""
+    own = (_within(distance, here) + _within(distance, there)) / 2
+    return (_over(distance, product(here, there)) - own).mean(1, keepdim=True)
 
 
 def merged(verdicts: Sequence[FieldVerdict]) -> list[FieldVerdict]:

@@ -24,7 +24,7 @@ from esp_cli.checking.comparison import (
     the_same,
 )
 from esp_cli.checking.shifting import Shift, Unmoved
-from esp_cli.checking.stepping import nudged, outcomes, played, seek_end, stretched, visit
+from esp_cli.checking.stepping import MOMENTS, nudged, outcomes, played, seek_end, stretched, visit
 from esp_cli.checking.verdicts import ENDS, ElementVerdict, FieldVerdict, Watch, may_come, verdicts_of
 from esp_cli.symmetry import Element, Transform, build_transform
 from esp_envs.promises import MakeWorlds
@@ -63,12 +63,13 @@ def check_paired(
     Of many elements, each is first tried in an eighth of the states: what is broken there is broken. What holds in all
     states that were visited is tried further out, too, where random play does not go: an element that is broken there
     is not covered. And it is tried in the steps that follow, in which clocks run and what no state holds builds up.
-    `until` and `spare` as in `verdicts_of`.
+    Short episodes are played several times, as chance takes many states. `until` and `spare` as in `verdicts_of`.
     """
     shown = make(1, [0]).spec
     most = _FEWEST_WORLDS if slow else _MOST_WORLDS
     worlds = max(_FEWEST_WORLDS, min(most, _NUMBERS // (shown.num_agents * shown.observation.width)))
-    visited = visit(make(worlds, [0]), watch, (until + time.monotonic()) / 2, early=slow)
+    env, rounds = make(worlds, [0]), 1 if slow else max(1, MOMENTS // shown.horizon)
+    visited = [one for _ in range(rounds) for one in visit(env, watch, (until + time.monotonic()) / 2, early=slow)]
     judge = _Judge(make, shown, visited, slow, until, len(elements) > _SOME)
     return verdicts_of(elements, judge, lambda element: is_declared(element, shown), watch, until, spare)
 
@@ -87,14 +88,15 @@ class _Judge:
         states, actions = (torch.cat(part, 1) for part in zip(*moments, strict=True))
         self._visited = moments if slow else [(states, actions)]
         self._some = [(state[:, ::_SOME], action[:, ::_SOME]) for state, action in self._visited]
+        self._ending = cache(self._sought)
 
     def __call__(self, element: Element | Shift) -> ElementVerdict:
         if self._quick and (found := self._fewer.judge(element)).outcome == "broken":
             return found
         found = self._everywhere.judge(element)
-        unseen = {f.field for f in found.fields if f.outcome != "holds"}
-        if found.outcome == "not covered" and unseen and unseen <= ENDS and self._ending is not None:
-            found = self._as_at_an_end(found, self._ending.judge(element))
+        unseen = frozenset(f.field for f in found.fields if f.outcome != "holds")
+        if found.outcome == "not covered" and unseen & ENDS and unseen <= ENDS | {"action mask"}:
+            found = self._as_at_an_end(element, found, unseen & ENDS)
         if found.outcome == "holds" and self._further is not None:
             found = self._as_beyond(found, self._further.judge(element), "further out", self._few)
         return self._as_later(element, found) if found.outcome == "holds" else found
@@ -111,9 +113,8 @@ class _Judge:
     def _further(self) -> _Pairs | None:
         return self._tried(lambda: [(stretched(state, self._spec.state), action) for state, action in self._some])
 
-    @cached_property
-    def _ending(self) -> _Pairs | None:
-        return self._tried(lambda: [seek_end(self._make, self._moments[0][0], self._later, self._until)])
+    def _sought(self, unseen: frozenset[str]) -> _Pairs | None:
+        return self._tried(lambda: [seek_end(self._make, self._moments[0][0], self._later, self._until, unseen)])
 
     @cached_property
     def _onwards(self) -> _Pairs | None:
@@ -133,10 +134,13 @@ class _Judge:
             return _Pairs(self._make, moments(), self._until, onwards)
         return None
 
-    def _as_at_an_end(self, found: ElementVerdict, near: ElementVerdict) -> ElementVerdict:
-        """Judge ends that did not come in play, and all that comes with them, where one was found."""
-        ends = {f.field: f for f in near.fields if f.field in ENDS and f.outcome == "holds"}
-        found = replace(found, fields=tuple(ends.get(f.field, f) for f in found.fields))
+    def _as_at_an_end(self, element: Element | Shift, found: ElementVerdict, unseen: frozenset[str]) -> ElementVerdict:
+        """Judge ends that did not come in play, and all that comes with them, as masks, where one was found."""
+        if (ending := self._ending(unseen)) is None:
+            return found
+        near = ending.judge(element)
+        held = {f.field: f for f in near.fields if f.outcome == "holds"}
+        found = replace(found, fields=tuple(f if f.outcome == "holds" else held.get(f.field, f) for f in found.fields))
         return self._as_beyond(found, near, "at an end", 0.0) if found.outcome == "holds" else found
 
     def _as_beyond(self, found: ElementVerdict, beyond: ElementVerdict, where: str, few: float) -> ElementVerdict:

@@ -7,7 +7,7 @@ both give the same, up to the transform, they have one distribution.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 
 import torch
@@ -140,17 +140,20 @@ def _joint_image(spec: TaskSpec, scene: Element) -> Callable[[Tensor], Tensor]:
     return lambda action: joined([one.action(action[own]) for one, own in maps])
 
 
-def seek_end(make: MakeWorlds, state: Tensor, steps: int, until: float) -> tuple[Tensor, Tensor]:
+def seek_end(
+    make: MakeWorlds, state: Tensor, steps: int, until: float, sought: Collection[str]
+) -> tuple[Tensor, Tensor]:
     """Return states [1, E, state width] and actions, of which up to a quarter end something; else a LookupError.
 
-    That is an episode, or what one agent does, as play did not. In half of the worlds all things gather first, as at a
-    goal. Worlds act at random, and go on from the quarter of them that was paid most so far.
+    That is an episode ("end") or what one agent does ("alive"): each that is `sought`, as play did not show it, has an
+    equal part. In half of the worlds all things gather first, as at a goal. Worlds act at random, and go on from the
+    quarter of them that was paid most so far.
     """
     env = make(state.shape[1], [0])
     env.renews, half = False, env.num_envs // 2
     state = torch.cat([stretched(state[:, :half], env.spec.state, decades=-3.0), state[:, half:]], 1)
     paid, count = torch.zeros(env.num_envs, device=state.device), max(1, env.num_envs // 4)
-    first, ends = None, list[tuple[Tensor, Tensor]]()
+    first, ends, missing = None, list[tuple[Tensor, Tensor]](), dict.fromkeys(sought, max(1, count // len(sought)))
     for _ in range(steps):
         stop_at(until)
         env.reset()
@@ -158,14 +161,17 @@ def seek_end(make: MakeWorlds, state: Tensor, steps: int, until: float) -> tuple
         action = env.random_action()
         step = env.step(action)
         first, alive = first or (state, action), step.reached.alive
-        over = (step.terminated if alive is None else step.terminated | ~alive.all(-1))[0]
-        ends.append((state[:, over], action[:, over]))
-        if sum(len(ended[0]) for ended, _ in ends) >= count:
+        for name, most in missing.items():
+            over = step.terminated if name == "end" or alive is None else ~alive.all(-1)
+            where = over[0].nonzero()[:most, 0]
+            ends.append((state[:, where], action[:, where]))
+            missing[name] -= len(where)
+        if not any(missing.values()):
             break
         paid = paid + step.reward.flatten(0, 1).flatten(1).mean(-1).nan_to_num(-torch.inf)
         best = paid.topk(count).indices.repeat(-(-env.num_envs // count))[: env.num_envs]
         state, paid = step.reached.state[:, best], paid[best]
-    ended, done = (torch.cat(part, 1)[:, :count] for part in zip(*ends, strict=True))
+    ended, done = (torch.cat(part, 1) for part in zip(*ends, strict=True))
     if first is None or not ended.shape[1]:
         raise LookupError
     return torch.cat([ended, first[0][:, ended.shape[1] :]], 1), torch.cat([done, first[1][:, ended.shape[1] :]], 1)

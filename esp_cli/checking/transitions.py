@@ -109,7 +109,8 @@ def _judge(element: Element, spaces: Spaces, halves: Sequence[_Half], first: Tra
         )
         still = all(float(half.spread[half.fields[name]].sum()) < STILL**2 for half in halves)
         # that it never changes is its law where it is seen; that of what never came is unknown
-        of_nothing = concluded(name, 0.0, 0.0, broken=False, p_value=float(may_come(name, ends, pays, forbids)))
+        may = _flags(spaces).get(name, True) and may_come(name, ends, pays, forbids)
+        of_nothing = concluded(name, 0.0, 0.0, broken=False, p_value=float(may))
         verdicts.append(of_nothing if still else _judged(name, alone, planted[:, counts], others))
     found = ElementVerdict(element.name, declared, (*verdicts, *_unrecorded(spaces, halves[0].fields)))
     image = turned(first, transform)
@@ -122,12 +123,17 @@ def _judge(element: Element, spaces: Spaces, halves: Sequence[_Half], first: Tra
     return found
 
 
+def _flags(spaces: Spaces) -> dict[str, bool]:
+    """Return whether a task has masks and ends, by field; spaces alone may say so of masks, and never that none are."""
+    if isinstance(spaces, TaskSpec):
+        return {"action mask": spaces.masks, "end": spaces.terminates, "alive": spaces.agents_end}
+    return {"action mask": True} if spaces.masks else {}
+
+
 def _unrecorded(spaces: Spaces, recorded: Collection[str]) -> list[FieldVerdict]:
     """Say that masks and ends of a task of which transitions hold nothing are not covered."""
-    flags = {"action mask": spaces.masks}
-    if isinstance(spaces, TaskSpec):
-        flags |= {"end": spaces.terminates, "alive": spaces.agents_end}
-    return [FieldVerdict(name, "not covered", 0.0, 0.0) for name, has in flags.items() if has and name not in recorded]
+    missing = (name for name, has in _flags(spaces).items() if has and name not in recorded)
+    return [FieldVerdict(name, "not covered", 0.0, 0.0) for name in missing]
 
 
 def _judged(name: str, alone: Tensor, planted: Tensor, others: Sequence[Tensor]) -> FieldVerdict:

@@ -257,3 +257,19 @@ def test_numbers_of_any_type_are_taken() -> None:
     (_, of_flags), (spaces, of_numbers) = gusts(torch.bool), gusts()
     found = [check_transitions(spaces, data, parse_elements("rot180", 1)) for data in (of_flags, of_numbers)]
     assert found[0] == found[1]
+
+
+@pytest.mark.parametrize(
+    ("field", "flag", "told"),
+    [("action_mask", "masks", "action mask"), ("terminated", "terminates", "end"), ("alive", "agents_end", "alive")],
+)
+def test_a_log_may_spell_out_that_a_task_without_masks_and_ends_has_none(field: str, flag: str, told: str) -> None:
+    env = make("navigation", 128, [0])
+    data = collect(env, 128)
+    nothing = torch.full(data.reward.shape, field != "terminated")
+    if field == "action_mask":
+        nothing = nothing.unsqueeze(-1).expand(-1, -1, -1, env.spec.action.count)
+    data = replace(data, **{field: nothing})
+    for spec, left in ((env.spec, []), (replace(env.spec, **{flag: True}), [told])):
+        (found,) = check_transitions(spec, data, parse_elements("rot90", spec))
+        assert [one.field for one in found.fields if one.error == 0 and one.outcome == "not covered"] == left

@@ -205,6 +205,11 @@ class Skewed(Point):  # gusts of mean 0 along y, seldom and strong up, often and
         return 0.1 * action + 0.3 * torch.cat([self.draw(1, 1), up], -1)
 
 
+class Coins(Point):  # one for x and one for y
+    def moved(self, world, action):
+        return 0.1 * action + 0.3 * self.draw(1, 2).sign()
+
+
 class Meadow(Point):  # in a field of 100 m, with small gusts
     size = 50.0
 
@@ -242,6 +247,13 @@ def test_breakings_by_chance_or_before_an_end_are_found(task, element, mirror, f
     outcome, fields = verdict(task, element)
     assert (outcome, field in fields) == ("broken", True)
     assert verdict(task, mirror)[0] == "holds"
+
+
+@pytest.mark.parametrize(("task", "outcome"), [(Coins, "holds"), (Street, "broken")])
+def test_an_episode_of_one_step_is_played_so_often_that_chance_is_judged(task, outcome):
+    make = lambda count, seeds: task(Settings(horizon=1), count, generators_for(seeds))  # noqa: E731
+    (found,) = check_symmetry(make, "flip-x").elements
+    assert found.outcome == outcome
 
 
 @pytest.mark.parametrize("task", [Point, Paid, Slow, Beside, Delayed, End, Meadow])
@@ -368,6 +380,60 @@ def test_ends_that_play_does_not_reach_are_sought_where_things_gather_and_where_
     assert verdict(Way, "flip-x")[0] == "holds"
     assert verdict(Bonus, "flip-x")[0] == "holds"
     assert verdict(Bonus, "rot90") == ("not covered", {"reward"})
+
+
+class Fenced(Way):  # where agents leave, in play
+    beside = 0.95
+
+    def _describe(self):
+        return replace(super()._describe(), agents_end=True)
+
+    def _living(self, world):
+        return world["position"][..., 1].abs() < self.beside
+
+
+class FencedFarOff(Fenced):
+    beside = 1.4
+
+
+class FencedHalf(FencedFarOff):
+    def _ended(self, world):
+        return super()._ended(world) & (world["position"][:, :, 0, 1] > 0)
+
+
+def test_an_end_is_sought_beside_ends_of_agents():
+    assert verdict(Fenced, "flip-x")[0] == "holds"
+    assert verdict(FencedFarOff, "flip-x")[0] == "holds"
+    assert verdict(FencedHalf, "flip-x") == ("not covered", {"end"})
+
+
+class Gone(Masked):  # an agent that leaves where play seldom goes, and then may do nothing
+    speed = 0.0005
+
+    def _describe(self):
+        return replace(super()._describe(), agents_end=True)
+
+    def _living(self, world):
+        return world["position"].norm(dim=-1) > 0.004
+
+    def _allow(self, world):
+        return self._living(world).unsqueeze(-1).expand(-1, -1, -1, 4)
+
+
+class GoneUnmasked(Gone):  # and something is forbidden further out alone
+    def _allow(self, world):
+        return Masked._allow(self, world)
+
+
+class GoneHalf(Gone):
+    def _allow(self, world):
+        return super()._allow(world) | (world["position"][..., :1] > 0)
+
+
+def test_masks_that_follow_ends_of_agents_are_seen_at_a_sought_end():
+    assert verdict(Gone, "rot90")[0] == "holds"
+    assert verdict(GoneUnmasked, "rot90") == ("not covered", {"action mask"})
+    assert verdict(GoneHalf, "rot90") == ("not covered", {"action mask"})
 
 
 def test_a_gap_is_told_in_deviations_of_the_field_or_of_a_small_number_up_to_one():
