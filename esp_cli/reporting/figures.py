@@ -81,11 +81,12 @@ def dots(
         axes.grid(visible=False, axis="y")
         low, high = axes.get_xlim()
         for index, (name, value) in enumerate((anchors or {}).items()):
+            label = f"{name} {round(value, 2):g}"
             if low <= value <= high:
                 dashes = _LINE_STYLES[(index + 1) % len(_LINE_STYLES)]
-                axes.axvline(value, linestyle=dashes, color="#777777", linewidth=1.2, label=f"{name} {round(value, 2):g}")
+                axes.axvline(value, linestyle=dashes, color="#777777", linewidth=1.2, label=label)
             else:
-                axes.plot([], [], " ", label=f"{name} {round(value, 2):g} (out of view)")
+                axes.plot([], [], " ", label=f"{label} (out of view)")
         axes.set_xlim(low, high)
         axes.xaxis.set_major_locator(MaxNLocator(nbins=8))
         axes.set_xlabel("\n".join(filter(None, (xlabel, caption(counts)))))
