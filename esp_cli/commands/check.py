@@ -63,7 +63,7 @@ def check(
         Path | None, Option("--rows", help="Observations that a policy meets [M, D].", metavar="FILE.npy")
     ] = None,
     root: options.RootOption = None,
-    seconds: options.SecondsOption = 50.0,
+    seconds: options.SecondsOption = 100.0,
     json: options.JsonOption = None,
 ) -> None:
     """Check a task, its declared symmetry, a robot's mirror that you wrote, or whether a policy turns with its robot.

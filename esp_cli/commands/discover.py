@@ -42,7 +42,7 @@ def discover(
     transforms: Annotated[str | None, Option("--transforms", help="Elements to try, as d8; by default many.")] = None,
     settings: TaskSetOption = None,
     logs: Annotated[bool, Option("--logs", help="Judge from transitions alone, also where states can be set.")] = False,
-    seconds: SecondsOption = 50.0,
+    seconds: SecondsOption = 100.0,
     json: JsonOption = None,
 ) -> None:
     """Find symmetries that nobody declared, and print the --transforms that use them.
