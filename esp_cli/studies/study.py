@@ -164,10 +164,9 @@ class StudyFolder:
         """Refuse a run beside one for which the user gave other settings, since a table compares the two."""
         if new.given is None or old.given is None:
             return
-        idle = new.config.without_effect() | old.config.without_effect()
         ours, theirs = ({"preset": cell.config.preset, **cell.config.by_name()} for cell in (new, old))
-        for name in ("preset", *sorted({*new.given, *old.given} - idle)):
-            if ours.get(name) != theirs.get(name):
+        for name in ("preset", *sorted({*new.given, *old.given})):
+            if ours.get(name) != theirs.get(name) and not any(name in c.config.without_effect() for c in (new, old)):
                 raise UserError(
                     f"{old.name} in {path} has {name} {theirs.get(name)}, and a table would compare it with "
                     f"{new.name}, which has {ours.get(name)}; give both the same, or choose another --out"
