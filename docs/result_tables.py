@@ -11,6 +11,7 @@ from esp_cli.policies.statistics import median_steps
 from esp_cli.reporting.results import CellResult, Results
 from esp_cli.reporting.tables import AHEAD, TABLES, Table, return_text
 from esp_cli.studies import paper
+from esp_cli.studies.catalogue import paired_name
 from esp_cli.studies.kinds import Team, kind_of
 
 
@@ -41,8 +42,7 @@ def paper_cells(name: str) -> Iterator[tuple[str, str, tuple[str, ...]]]:
                 for algorithm in kind.algorithms:
                     for settings in kind.variants.values():
                         key = (*team.place, str(steps), algorithm, str(settings["prior.kind"]))
-                        variant = algorithm.upper() + ("" if key[-1] == "none" else "-ESP")
-                        yield f"{team.label}, {format_exactly(steps)}", variant, key
+                        yield f"{team.label}, {format_exactly(steps)}", paired_name(algorithm, key[-1]), key
 
 
 def pairs_table(results: Results) -> Table:

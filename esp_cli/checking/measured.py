@@ -9,7 +9,7 @@ from functools import lru_cache
 from esp_cli.checking.task import TRANSITIONS, check_symmetry, judged
 from esp_cli.checking.verdicts import ElementVerdict
 from esp_cli.symmetry import Group, parse_elements
-from esp_cli.symmetry.admission import DISCOVERED, admitted_elements, carries, unrestricted
+from esp_cli.symmetry.admission import DISCOVERED, admitted_elements, all_carry, unrestricted
 from esp_cli.training.config import RunConfig
 from esp_envs.base import Environment, generators_for
 from esp_envs.errors import UserError
@@ -60,8 +60,7 @@ def _effective(config: RunConfig) -> RunConfig:
 def _declares(config: RunConfig) -> bool:
     """Return whether the task declares the transforms of its prior, or nobody has to."""
     spec, transforms = _maker(_of(config))(1, [0]).spec, config.prior.transforms
-    own = ((transforms if role.num_agents > 1 else without_agents(transforms), role) for role in spec.roles or (spec,))
-    return transforms.startswith(DISCOVERED) or all(not text or carries(text, role) for text, role in own)
+    return transforms.startswith(DISCOVERED) or all_carry(transforms, spec.roles or (spec,))
 
 
 def _listed(transforms: str, config: RunConfig) -> str:

@@ -42,10 +42,8 @@ _LATER, _LATER_OF_SLOW = 128, 32
 """Steps that are followed from an episode's start, for what builds up that no state holds, or until an end is found;
 of slow simulators fewer."""
 _LONG = 0.25  # share of the states that differ from which rounding is no reason, however many steps it had to grow
-_HERE, _THERE = (
-    (101, 102, 105, 107),
-    (103, 104, 106, 108),
-)  # seeds of runs from states, and from images, with own chance
+_HERE = (101, 102, 105, 107)  # seeds of runs from the states, with chance of their own
+_THERE = (103, 104, 106, 108)  # of those from their images
 _NEAR = -1  # stands for a run from states nearby, with the chance of the first
 Visited = tuple[Tensor, Tensor]  # states [1, E, state width] and joint actions
 
@@ -172,7 +170,8 @@ class _Pairs:
             env.renews = False
         self._spec = self._twins[0].spec
         self._here = cache(lambda run: self._play(self._twins[min(run, 1)], visited, Unmoved(), _HERE[run]))
-        self._here(0), self._here(1)
+        for run in (0, 1):
+            self._here(run)  # now, where an error says that these states cannot be played
         near = [(nudged(state), action) for state, action in visited]
         self._near = self._play(self._twins[0], near, Unmoved(), _HERE[0])
 

@@ -134,7 +134,7 @@ def _pairs(
             yield Cell(
                 name=f"{stem}-{file_name(variant)}",
                 panel=f"{team.label}, {format_exactly(steps)}",
-                variant=_paired_name(algorithm, prior),
+                variant=paired_name(algorithm, prior),
                 config=config,
                 reference=None if prior == "none" else f"{stem}-plain",
                 paper=(*team.place, str(steps), algorithm, prior) if _comparable(config, team.settings) else None,
@@ -162,7 +162,7 @@ def _variants(
             place = tuple(part.format(**fields) for part in named)
             yield Cell(
                 name=f"{stem}-{file_name(variant)}",
-                panel=", ".join([*heads, _paired_name(algorithm, "none"), format_exactly(steps)]),
+                panel=", ".join([*heads, paired_name(algorithm, "none"), format_exactly(steps)]),
                 variant=variant,
                 config=config,
                 reference=None if variant == variants[0] else f"{stem}-{file_name(variants[0])}",
@@ -233,12 +233,12 @@ def _refuse_unused(kind: StudyKind, request: Request, tasks: Sequence[str], algo
         raise UserError(f"--steps says nothing about {unserved[0]}; add a number of steps for all tasks, or for it")
     refuse_unknown_or_twice("task", tasks, tasks)
     refuse_unknown_or_twice("algorithm", algorithms, algorithms)
-    called = {_paired_name(algorithm, "none"): algorithm for algorithm in algorithms}
+    called = {paired_name(algorithm, "none"): algorithm for algorithm in algorithms}
     for algorithm in algorithms:
-        if (other := called[name := _paired_name(algorithm, "none")]) != algorithm:
+        if (other := called[name := paired_name(algorithm, "none")]) != algorithm:
             raise UserError(f"tables would call both {algorithm} and {other} {name}; rename yours, or run one alone")
 
 
-def _paired_name(algorithm: str, prior: str) -> str:
+def paired_name(algorithm: str, prior: str) -> str:
     """Return how the paper calls an algorithm without the prior and with it: "MADDPG", "MADDPG-ESP"."""
     return algorithm.rpartition(":")[2].upper() + ("" if prior == "none" else "-ESP")

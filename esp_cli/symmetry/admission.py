@@ -77,7 +77,7 @@ def default_transforms(spaces: Spaces, weighed: bool = False) -> str:
     """
     if isinstance(spaces, TaskSpec) and spaces.roles:
         own = [default_transforms(role, weighed) for role in spaces.roles]
-        return next((name for name in own if _all_carry(name, spaces.roles, weighed)), own[0])
+        return next((name for name in own if all_carry(name, spaces.roles, weighed)), own[0])
     declared = _factors(spaces)
     listed = [name for name in declared[:1] if name != "so2"]
     chosen = next((name for name in ("d4", *listed, "c4", *declared) if carries(name, spaces)), "d4")
@@ -97,7 +97,8 @@ def moves_some_number(elements: Sequence[Element], spaces: Spaces) -> bool:
     return not all(operator.is_identity for operator in moved)
 
 
-def _all_carry(name: str, roles: Sequence[TaskSpec], weighed: bool) -> bool:
+def all_carry(name: str, roles: Sequence[TaskSpec], weighed: bool = False) -> bool:
+    """Return whether every role carries what a name means to it; where it is `weighed`, nothing has to be declared."""
     meant = [(name if role.num_agents > 1 else without_agents(name), role) for role in roles]
     return all(not text or carries(text, unrestricted(role) if weighed else role) for text, role in meant)
 
