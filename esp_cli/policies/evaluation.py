@@ -31,6 +31,7 @@ from esp_envs.registry import TASKS
 
 _ROUGH_AGENT_STEPS, _ROUGH_ERROR = 5000, 0.1
 """Of each reference policy where a second has to do, and the largest standard error, as a share of their scale."""
+_BLIND_EPISODES = 500
 _STREAM = "judgement"  # names the worlds; the word decides the numbers of every final evaluation, so it stays
 Metrics = dict[str, float | None]
 
@@ -124,8 +125,20 @@ def play_references(config: RunConfig, names: Sequence[str], episodes: int) -> d
     """Play the random policy and the task's heuristics: "random", "heuristic" for the first, others by name."""
     anchors = {"random": play_batches(config, ScriptedController(methodcaller("random_action")), "random", episodes)}
     for key, name in zip(("heuristic", *names[1:]), names, strict=False):
-        anchors[key] = play_batches(config, ScriptedController(methodcaller("heuristic", name)), "heuristic", episodes)
+        anchors[key] = _play_heuristic(config, name, episodes)
     return anchors
+
+
+def blind_anchor(config: RunConfig) -> dict[str, float]:
+    """Return the mean return of the task's policy that sees nothing, by its name; none where the task has none."""
+    config = config.model_copy(update={"seeds": config.seeds[:1], "device": "cpu"})
+    if BLIND not in build_environment(config, 1, _STREAM, "shape").heuristics:
+        return {}
+    return {BLIND: float(_play_heuristic(config, BLIND, _BLIND_EPISODES).returns.mean())}
+
+
+def _play_heuristic(config: RunConfig, name: str, episodes: int) -> Episodes:
+    return play_batches(config, ScriptedController(methodcaller("heuristic", name)), "heuristic", episodes)
 
 
 def rough_anchors(config: RunConfig, episodes: int) -> dict[str, float]:

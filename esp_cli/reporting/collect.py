@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from esp_cli.defaults import Mode
 from esp_cli.files.documents import flat
 from esp_cli.files.formatting import format_exactly, name_of
-from esp_cli.policies.evaluation import FinalEvaluation
+from esp_cli.policies.evaluation import FinalEvaluation, blind_anchor
 from esp_cli.policies.statistics import Passing, area_under_curve, steps_to_threshold
 from esp_cli.reporting.results import CellResult, Results, returns_of, summarised
 from esp_cli.studies.kinds import kind_of
@@ -111,6 +111,7 @@ class _State:
     final: FinalEvaluation | None = None  # of its policy, if there is one
     stopped: bool = False  # whether it ended without a policy, since every seed stopped
     at: int | None = None  # step at which runs put together by hand are compared; None for the final evaluation
+    floor: Mapping[str, float] = field(default_factory=dict)  # their anchor: what a policy that sees nothing reaches
 
 
 def collect_study(folder: StudyFolder, mode: Mode | None = None, thresholds: Sequence[float] = ()) -> Material:
@@ -131,13 +132,15 @@ def collect_runs(
     at = _compared_at(curves, at)
     curves = [_thinned(curve, at, max(map(_apart, curves))) for curve in curves]
     first, *_ = curves
+    today = first.spec.version == spec_of(first.config.of_one_seed()).version
+    floor = blind_anchor(first.config) if today else {}
     cells, states, by_name = [], {}, {}
     for step in at:
         for k, curve in enumerate(curves):
             name, reference = f"{k}-{curve.label}-{step}", f"0-{first.label}-{step}" if k else None
             panel = f"{curve.config.task}, {format_exactly(step)}"
             cells.append(Cell(name=name, panel=panel, variant=curve.label, config=curve.config, reference=reference))
-            states[name], by_name[name] = _State(curve.last_step, curve, at=step), curve
+            states[name], by_name[name] = _State(curve.last_step, curve, at=step, floor=floor), curve
     study = Study(
         kind="runs",
         title=f"{' and '.join(curve.label for curve in curves)} on {first.config.task}",
@@ -268,6 +271,7 @@ def _cell(study: Study, cell: Cell, state: _State, mode: Mode, config: Mapping[s
             "convention": compared.spec.convention,
             "episodes": cell.config.evaluation.episodes,
             "returns": {mode: _rounded(compared.values[-1])},
+            "anchors": {name: round(value, _DIGITS) for name, value in state.floor.items()},
         }
     status = "finished" if fields else "unfinished" if curve is not None else "not run"
     if fields and compared is not None:

@@ -175,6 +175,10 @@ def _outcome(material: Material) -> list[str]:
         ranked = [_ranking(panel, results) for panel in dict.fromkeys(cell.panel for cell, _ in pairs)]
         return [*ranked, *_too_few(pairs), *left_out]
     texts = _count(pairs) if pairs else [_returns(results, cell) for cell in finished[:2]]
+    if finished and not pairs:
+        alone = any(cell.reference for cell in finished)
+        texts += [f"The table has {len(finished) - 2} more."] if len(finished) > 2 else []
+        texts += ["Nothing is compared: the reference of no run has a return here."] if alone else []
     return [*texts, *left_out] or ["No run has a return yet."]
 
 

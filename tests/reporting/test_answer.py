@@ -125,3 +125,15 @@ def test_runs_that_differ_alike_with_every_seed_are_counted_among_several(tmp_pa
         "Of 3 runs beside their reference: better 1, not told apart 0, worse 0, by the same with every seed 2 "
         "(95 % intervals of the difference)."
     )
+
+
+def test_runs_without_a_finished_reference_say_so_and_how_many_there_are(tmp_path: Path) -> None:
+    folder = StudyFolder.create(tmp_path / "s", small_study("ablate-modules", algorithms=("mappo",)))
+    for cell in folder.study.cells[1:]:
+        write_run(folder, cell, [[-200.0] * 3, [-150.0] * 3], [-150.0] * 3)
+    assert answer(collect_study(folder))[2:] == [
+        "The table has 1 more.",
+        "Nothing is compared: the reference of no run has a return here.",
+    ]
+    write_run(folder, folder.study.cells[0], [[-200.0] * 3, [-150.0] * 3], [-150.0] * 3)
+    assert not any("1 more" in line for line in answer(collect_study(folder)))

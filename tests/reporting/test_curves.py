@@ -259,3 +259,14 @@ def test_a_run_reaches_what_it_ended_with_however_that_is_rounded():
     rising = curve([[-200.0], [-187.80964]], "one", (0, 100), (0,))
     (cell,) = gathered([rising]).results.cells
     assert (cell.steps_to[0].threshold, cell.steps_to[0].of_mean) == (-187.8096, 100)
+
+
+def test_no_verdict_between_runs_that_are_below_a_policy_that_sees_nothing():
+    def verdict(shift):
+        seeds = tuple(range(10))
+        rows = [shift + np.array([[-9.0] * 10, k * (100 + np.arange(10.0) ** 2)]) for k in (0, 1)]
+        cells = gathered([curve(x, f"run {k}", (0, 100), seeds) for k, x in enumerate(rows)]).results.cells
+        assert 0 > cells[1].anchors["blind"] > -500
+        return cells[1].summary.gap.ahead
+
+    assert (verdict(0.0), verdict(-5000.0)) == ("ahead", "blind")
