@@ -56,7 +56,8 @@ def spec_with_roles(roles: Sequence[Role], *, symmetry: str, state: Layout | Non
         own = roles[0]
         state = joint_layout(own.observation, own.num_agents) if state is None else state
         return TaskSpec(**vars(own) | named, state=state, symmetry=symmetry)
-    if not roles or len(set(names)) < len(names) or not all(name.isidentifier() for name in names):
+    words = {name.upper().encode("ascii", "replace") for name in names}  # files and C cannot tell others apart
+    if not roles or len(words) < len(names) or not all(name.isidentifier() for name in names):
         raise UserError(f"roles are named {', '.join(names) or 'not at all'}; give each a word of its own")
     actions = [role.action for role in roles]
     if len({type(action) for action in actions}) > 1:

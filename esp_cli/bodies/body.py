@@ -14,7 +14,7 @@ from esp_cli.bodies.finding import Difference, Found, find
 from esp_cli.bodies.frame import Frame
 from esp_cli.bodies.kinds import Parts, named_parts
 from esp_cli.bodies.proof import NEARLY
-from esp_cli.bodies.reading import MOST_BODIES, MOST_MOVING, is_urdf, printable, quiet, read_model
+from esp_cli.bodies.reading import MOST_BODIES, MOST_MOVING, printable, quiet, read_model
 from esp_cli.symmetry.elements import Floats
 from esp_cli.symmetry.parse import parse_elements
 from esp_cli.symmetry.plane import PlaneElement
@@ -113,10 +113,7 @@ class Body:
         seconds: float = SECONDS,
     ) -> Body:
         """Find and prove the symmetries of a URDF file; its first link moves freely unless `floating` is false."""
-        model = read_model(path, root, floating)
-        if not is_urdf(path):
-            raise UserError(f"{path} is MJCF, not URDF; read it with Body.from_mjcf")
-        return cls._from_model(model, tolerated, seconds)
+        return cls._from_model(read_model(path, root, floating, urdf_only=True), tolerated, seconds)
 
     @classmethod
     @quiet()
@@ -136,6 +133,8 @@ class Body:
         names = {frame.name("joint", j): j for j in range(model.njnt) if j != frame.base}
         controls = {frame.name("actuator", a): slice(a, a + 1) for a in range(model.nu)}
         limbs = {frame.name("body", b): slice(b, b + 1) for b in range(model.nbody)}
+        if len(names) + len(controls) + len(limbs) < model.njnt - (frame.base is not None) + model.nu + model.nbody:
+            raise UserError("a joint, actuator or body without a name is called as another is; give each a name")
         self._set(
             Parts("joints", {n: frame.qpos_of(j) for n, j in names.items()}, {g: m.qpos for g, m in matches.items()}),
             Parts("joints", {n: frame.dofs_of(j) for n, j in names.items()}, {g: m.qvel for g, m in matches.items()}),
@@ -171,6 +170,11 @@ class Body:
     def not_covered(self) -> dict[str, str]:
         """Those of `refused` that may hold, since nobody looked, or nothing would have shown."""
         return {name: reason for name, reason in self.refused.items() if reason.startswith("not covered")}
+
+    def unseen(self, element: str) -> list[str]:
+        """Return the joints of a model at which no mistake in an element would show in accelerations."""
+        would_show = self.found[element].proof.would_show
+        return [joint for joint, _, _, _, planted, _ in self.rows(element) if not would_show(planted)]
 
     def rows(self, element: str) -> list[tuple[str, str, int, float, float, Difference]]:
         """Return of each joint of a model, for one of `found`: name, image, sign, gap, planted gap, difference.

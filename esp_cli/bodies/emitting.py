@@ -81,11 +81,16 @@ def _data(body: Body, numbers: Numbers, model: str, elements: Sequence[PlaneElem
         "MODEL": model,
         "MADE_BY": f"esp mirror {__version__}",
         "ELEMENTS": tuple(element.name for element in elements),
-        "PROOF": {name: f"accelerations agree to {found.proof.gap:.2g}" for name, found in body.found.items()},
+        "PROOF": {name: _proven(body, name) for name in body.found},
         "NUMBERS": {name: labels_of(layout) for name, layout in numbers.items()},
         "ACTIONS": moves.pop(ACTION),
         "OBSERVATIONS": moves,
     }
+
+
+def _proven(body: Body, element: str) -> str:
+    unseen = ", ".join(body.unseen(element))
+    return f"accelerations agree to {body.found[element].proof.gap:.2g}" + f"; not covered: {unseen}" * bool(unseen)
 
 
 def proof(body: Body, numbers: Numbers, file: str) -> str:

@@ -194,7 +194,8 @@ def named_parts(what: str, names: Sequence[str] | None, tables: Mapping[str, Any
         named = [pair for table in tables.values() if isinstance(table, Mapping) for pair in table.items()]
         names = list(dict.fromkeys(name for pair in named for name in pair))
     names = _listed(f"the list of {what}", names)
-    generators = {_element_of(word): _matrix(what, names, table) for word, table in tables.items()}
+    elements = {word: _element_of(word) for word in tables}
+    generators = {elements[word]: _matrix(what, names, table, elements[word]) for word, table in tables.items()}
     group = FiniteGroup.generated_by("the body", list(generators))
     moves: dict[PlaneElement, Floats] = {PlaneElement(): np.eye(len(names))}
     while len(moves) < group.order:
@@ -224,12 +225,12 @@ def _element_of(word: str) -> PlaneElement:
     return PlaneElement.of(found[0])
 
 
-def _matrix(what: str, names: Sequence[str], table: Mapping[str, str]) -> Floats:
-    """Return the signed permutation of a table, completed by the partners of those that it names."""
+def _matrix(what: str, names: Sequence[str], table: Mapping[str, str], element: PlaneElement) -> Floats:
+    """Return the signed permutation of a table; where the element undoes itself, partners complete it."""
     if not isinstance(table, Mapping) or not all(isinstance(n, str) for pair in table.items() for n in pair):
         raise UserError(f"the mirror of the {what} is {table!r}; give by name the name of its image")
     images = dict(table)
-    for part, image in table.items():
+    for part, image in table.items() if (element @ element).is_identity else ():
         target = image.removeprefix("-")
         images.setdefault(target, image.removesuffix(target) + part)
     matrix = np.zeros((len(names), len(names)))

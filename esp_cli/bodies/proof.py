@@ -133,6 +133,8 @@ def prove(frame: Frame, match: Match, seed: int = 0) -> Proof:
     sensors, unjudged, unlike = _sensors(frame, here, there)
     unmet = ("contacts with the world (not covered: no state has any)",)
     unlike += unmet * (frame.base is not None and 0 in frame.shapes and not lying)
+    off = np.flatnonzero(frame.model.eq_active0 == 0).tolist()
+    unlike += tuple(f"{printable(frame.name('equality', k))} (not covered: it is switched off)" for k in off)
     lain = medians[2] if lying else None
     return Proof(joints, np.array(planted), median, medians[0], lain, worst, sensors, unjudged, unlike)
 

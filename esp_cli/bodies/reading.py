@@ -19,8 +19,10 @@ mujoco.set_mju_user_warning(lambda _: None)  # by default they go to a file in t
 XML_MIB, ASSET_MIB = 16, 256  # largest size of an XML file, and of a mesh or picture
 MOST_ELEMENTS, MOST_DEPTH, MOST_BODIES, MOST_MOVING = 50_000, 100, 1000, 200
 """Most elements of a model after replication, depth of nesting, bodies, and degrees of freedom or actuators."""
-_LIMITS = dict.fromkeys(("nrow", "ncol", "width", "height", "nuser", "nkey"), 65_536)
-_LIMITS |= dict.fromkeys(("njmax", "nconmax", "nstack"), 10**7) | {"memory": 2**30}
+_AREA, MOST_CELLS = ("nrow", "ncol", "width", "height"), 2**25
+"""What spans pictures and height fields, and most cells of all of them together."""
+_LIMITS = dict.fromkeys(("nuser", "nkey"), 65_536) | {"params": 1000, "memory": 2**30}
+_LIMITS |= dict.fromkeys(("njmax", "nconmax", "nstack"), 10**7)
 """Largest numbers that ask MuJoCo for memory, by how their attributes begin."""
 _COUNTED = ("replicate", "composite", "flexcomp")
 _UNITS = "KMGTPE"
@@ -31,7 +33,7 @@ def printable(text: str) -> str:
     return text if text and text.isprintable() else repr(text)
 
 
-def read_model(path: Path | str, root: Path | str | None = None, floating: bool = True) -> Any:
+def read_model(path: Path | str, root: Path | str | None = None, floating: bool = True, urdf_only: bool = False) -> Any:
     """Return the `mujoco.MjModel` of an MJCF or URDF file.
 
     A world without geometry gets a floor, so that contacts can be compared.
@@ -40,6 +42,7 @@ def read_model(path: Path | str, root: Path | str | None = None, floating: bool 
         path: of the file.
         root: the folder that holds all files that are read; by default that of `path`.
         floating: whether the first link of a URDF moves freely; MuJoCo would weld it to the world.
+        urdf_only: whether MJCF is refused.
 
     Raises:
         UserError: the file is missing, no model, or too large; it names files outside `root`; or MuJoCo refuses it.
@@ -50,6 +53,8 @@ def read_model(path: Path | str, root: Path | str | None = None, floating: bool 
     if root is not None and not Path(root).is_dir():
         raise UserError(f"there is no folder {root}; name the one that holds all files of the model as root (--root)")
     tag = _inspected(path, (path.parent if root is None else Path(root)).resolve())
+    if urdf_only and tag == "mujoco":
+        raise UserError(f"{path} is MJCF, not URDF; read it with Body.from_mjcf")
     with quiet():
         try:
             spec = mujoco.MjSpec.from_file(str(path))
@@ -71,11 +76,6 @@ def read_model(path: Path | str, root: Path | str | None = None, floating: bool 
             raise UserError(f"MuJoCo cannot read {printable(str(path))}: {words[:300]}") from None
 
 
-def is_urdf(path: Path | str) -> bool:
-    """Return whether a file that can be read is URDF."""
-    return _parsed(Path(path)).tag == "robot"
-
-
 @contextmanager
 def quiet() -> Iterator[None]:
     """Keep warnings to itself, and put MuJoCo's errors in a sentence, as where contacts need too much memory."""
@@ -95,15 +95,19 @@ def _inspected(path: Path, allowed: Path) -> str:
         raise UserError(f"{path} is neither MJCF nor URDF: its first element is {printable(tag)}")
     folders = {folder for folder, _ in trees}
     told = {x for _, tree in trees for c in tree.iter("compiler") for x in c.attrib.values() if x}
-    folders |= {path.parent / _short(path, x) for x in told}
-    elements, waiting = 0, [(tree, 1, 1) for _, tree in reversed(trees)]
+    folders |= {folder / _short(path, x) for folder, _ in trees for x in told}
+    elements, cells, waiting = 0, 0, [(tree, 1, 1) for _, tree in reversed(trees)]
     while waiting:
         element, times, depth = waiting.pop()
         if element.tag in _COUNTED:
             times *= math.prod(map(_whole, element.attrib.get("count", "1").split()))
         elements += times
+        spans = [_whole(word) for name in _AREA if (word := element.attrib.get(name))]
+        cells += times * math.prod(spans * 2 if len(spans) == 1 else spans) * bool(spans)  # one spans a square
         if elements > MOST_ELEMENTS or depth > MOST_DEPTH:
             raise UserError(f"{path} has more than {MOST_ELEMENTS} elements, or nests too deep")
+        if cells > MOST_CELLS:
+            raise UserError(f"{path} has pictures and height fields of more than {MOST_CELLS} cells; give smaller ones")
         for key, value in element.attrib.items():
             if key.startswith("file"):
                 for found in _files(path, value, folders, allowed):
@@ -149,10 +153,13 @@ def _short(main: Path, name: str) -> str:
 
 
 def _whole(word: str) -> int:
-    """Return a whole number of an attribute, with its unit as in memory="2M"; 1 for any other word."""
+    """Return a number of an attribute as a whole one, with its unit as in memory="2M"; 1 for any other word."""
     power = _UNITS.find(word[-1:].upper()) + 1
-    digits = word[:-1] if power else word
-    return int(digits[:20]) * 1024**power if digits.isdecimal() else 1
+    try:
+        number = float(word[:-1] if power else word)
+    except ValueError:
+        return 1
+    return int(min(max(number, 1.0), 1e18)) * 1024**power  # 1 for NaN too
 
 
 def _check_size(path: Path, most: int) -> None:
@@ -172,7 +179,11 @@ def _parsed(path: Path) -> ElementTree.Element:
 
 
 class _Builder(ElementTree.TreeBuilder):
-    """Builds elements, and refuses a document type before its entities are read."""
+    """Builds elements, called as MuJoCo calls them, and refuses a document type before its entities are read."""
+
+    def start(self, tag: str, attrs: dict[str, str]) -> ElementTree.Element:
+        """Begin an element; MuJoCo knows no namespaces, so that of a tag hides nothing."""
+        return super().start(tag.rpartition("}")[2], attrs)
 
     def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
         """Refuse."""

@@ -94,6 +94,9 @@ def _write(body: Body, model: Path, order: str | None, host: str, out: Path) -> 
     groups = "; ".join(f"{name}: {layout.summary}" for name, layout in layouts.items())
     console.say(f"{out} has {HOSTS[host]} for {', '.join(body.found)}; {groups}")
     console.note(f"{_proof_of(out)} proves it, with numpy alone")
+    for name in body.found:
+        if unseen := body.unseen(name):
+            console.note(f"{name} is not covered at {', '.join(unseen)}: a mistake would not show in accelerations")
     for name, reason in body.not_covered.items():
         console.note(f"it has no {name}, which is {reason}")
     if order is None:
@@ -201,7 +204,7 @@ def _print(body: Body, model: Path) -> None:
             console.say(f"  differs from its image, though accelerations do not show it: {_some(one.proof.unlike)}")
         if one.proof.unjudged:
             console.say(f"  not judged: sensors of the kinds {', '.join(one.proof.unjudged)}")
-        if unseen := [joint for joint, _, _, _, planted, _ in body.rows(name) if not one.proof.would_show(planted)]:
+        if unseen := body.unseen(name):
             console.say(f"  not covered: a mistake at {', '.join(unseen)} would not show in accelerations")
     for name, reason in body.refused.items():
         console.say(f"{called[name]} " + ("is " if name in body.not_covered else "does not hold: ") + reason)

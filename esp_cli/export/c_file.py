@@ -44,7 +44,8 @@ def c_source(program: Program, comment: str) -> dict[str, bytes]:
 def example_source(program: Program, example: dict[str, Any]) -> bytes:
     """Return a program that acts on the worked example, and says whether it acts as it should."""
     sets = {name: example["sets"][given] for given, name in named(example.get("sets", ())).items()}
-    given = {"program": program, "returns": _returns(program), "example": example, "sets": sets}
+    allowed = np.ravel(example.get("action_mask", ())).astype(int).tolist()
+    given = {"program": program, "returns": _returns(program), "example": example, "sets": sets, "allowed": allowed}
     return filled("policy_example.c", **given, numbers=numbers)
 
 

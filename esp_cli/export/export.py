@@ -134,7 +134,7 @@ def _made(trained: TrainedPolicy, formats: Sequence[str]) -> tuple[Exported, Fil
         raise UserError(f"{trained.source} sees no number, which {formats} cannot hold; choose onnx or numpy")
     sample = take_sample(trained, program)
     description = describe(trained, program, sample)
-    drives = "robot" in description and "numpy" in formats and not program.memory_width
+    drives = "robot" in description and "numpy" in formats and not (program.memory_width or program.sets)
     seen, note = epuck.seen_from_poses(trained, description) if drives else (None, None)
     job = Job(trained, program, sample, description, words(trained, program, description), seen, note)
     files = {name: FORMATS[name].write(job) for name in formats}
@@ -162,13 +162,15 @@ def refuse_taken(folders: Iterable[Path], formats: Sequence[str], force: bool) -
 
 
 def _put(files: Files, folder: Path) -> None:
-    """Put files into a folder, each as a whole, in the place of all files of an export that is there."""
+    """Put files into a folder, each as a whole, in the place of all files of an export that is there.
+
+    The description goes first and comes last: a folder with one is never half of an old export and half of a new one.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    gone = _exported(folder) - files.keys()
-    for name, content in files.items():
-        replace_file(folder / name, content)
-    for name in gone:
+    for name in (*sorted(_exported(folder) - files.keys()), DESCRIPTION):
         (folder / name).unlink(missing_ok=True)
+    for name in sorted(files, key=DESCRIPTION.__eq__):
+        replace_file(folder / name, files[name])
 
 
 def _exported(folder: Path) -> set[str]:

@@ -62,6 +62,11 @@ def test_contacts_that_no_state_has_are_not_covered():
     assert proof_of(text).unlike == ("contacts with the world (not covered: no state has any)",)
 
 
+def test_equalities_that_are_switched_off_are_not_covered():
+    text = changed("</mujoco>", '<equality><weld name="dock" body1="pelvis" active="false"/></equality></mujoco>')
+    assert proof_of(text).unlike == ("dock (not covered: it is switched off)",)
+
+
 HOW = {
     'friction="2 0.1 0.1"': "friction",
     'solref="0.1 1"': "solref",

@@ -50,6 +50,15 @@ def imported(text: str, folder: Path, name: str = "mirror"):
     return SimpleNamespace(**runpy.run_path(str(folder / f"{name}.py")))
 
 
+def test_the_file_says_where_no_mistake_would_show():
+    swing = '<body><joint name="swing" axis="1 0 0"/><geom type="capsule" fromto="0 0 0 0 0 -1" size=".1"/></body>'
+    cart = f'<mujoco><worldbody><body><joint name="cart" type="slide" axis="1 0 0"/><geom size=".1"/>{swing}'
+    motor = '<actuator><motor joint="swing"/></actuator>'
+    body = Body.from_mjcf(mujoco.MjModel.from_xml_string(f"{cart}</body></worldbody>{motor}</mujoco>"))
+    numbers = {"policy": layout(body.positions()), ACTION: layout(body.positions(["swing"]))}
+    assert "to 0; not covered: cart'" in emitted(body, numbers, "cart.xml")
+
+
 def test_the_file_does_what_the_layouts_say(body, tmp_path):
     numbers = groups(body)
     module = imported(emitted(body, numbers, "biped.xml"), tmp_path)

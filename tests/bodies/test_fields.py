@@ -186,6 +186,12 @@ def test_tables_that_are_no_symmetry_are_refused(mirror, words):
         Body(["a", "b", "c"], mirror)
 
 
+def test_a_turn_that_does_not_undo_itself_is_not_completed():
+    with pytest.raises(UserError, match="to or from a"):
+        Body(["a", "b", "c", "d"], {"rot90": {"a": "b", "c": "d"}})
+    assert Body(["a", "b"], {"rot180": {"a": "b"}}).elements, "the control"
+
+
 @pytest.mark.parametrize(
     ("joints", "mirror", "words"),
     [

@@ -2,6 +2,7 @@
 
 import os
 
+import mujoco
 import pytest
 
 from esp_cli.bodies import Body, read_model
@@ -41,13 +42,19 @@ def sentence(path, **choice) -> str:
         ("<b>" * 200 + "</b>" * 200, "neither"),
         ("<mujoco>" + "<b>" * 200 + "</b>" * 200 + "</mujoco>", "too deep"),
         ('<mujoco><replicate count="999"><replicate count="999"><geom/></replicate></replicate></mujoco>', "more than"),
-        ('<mujoco><asset><hfield name="h" nrow="70000" ncol="70000" size="1 1 1 1"/></asset></mujoco>', "nrow"),
+        ('<mujoco><asset><hfield name="h" nrow="70000" ncol="70000" size="1 1 1 1"/></asset></mujoco>', "cells"),
+        ('<mujoco><size nuser_body="70000"/></mujoco>', "nuser_body"),
+        ('<mujoco><asset><texture builtin="flat" type="cube" width="30000"/></asset></mujoco>', "cells"),
+        ('<mujoco><asset><mesh name="m" builtin="supersphere" params="1e6 1 1"/></asset></mujoco>', "params"),
+        ('<mujoco><replicate xmlns="a" count="99999"><geom/></replicate></mujoco>', "more than"),
         ('<mujoco><size memory="100G"/></mujoco>', "memory"),
         ('<mujoco><include file="../secret.xml"/></mujoco>', "outside"),
         ('<mujoco><asset><mesh file="../secret.xml"/></asset></mujoco>', "outside"),
         ('<mujoco><compiler meshdir=".."/><asset><mesh file="secret.xml"/></asset></mujoco>', "outside"),
         ('<mujoco><asset><mesh file="link.xml"/></asset></mujoco>', "outside"),
         ('<mujoco><include file="inner/more.xml"/></mujoco>', "outside"),
+        ('<mujoco><include xmlns="a" file="inner/more.xml"/></mujoco>', "outside"),
+        ('<mujoco><asset><model name="c" file="inner/part.xml"/></asset></mujoco>', "outside"),
         ('<mujoco><include file="pipe"/></mujoco>', "no regular file"),
         ('<mujoco><asset><mesh file="pipe"/></asset></mujoco>', "no regular file"),
         ('<mujoco><asset><texture file="../pipe"/></asset></mujoco>', "outside"),
@@ -64,6 +71,9 @@ def test_bad_files_end_in_one_sentence(tmp_path, text, words):
     for pipe in (folder / "pipe", tmp_path / "pipe"):
         os.mkfifo(pipe)
     (folder / "inner" / "more.xml").write_text('<mujocoinclude><include file="../../secret.xml"/></mujocoinclude>')
+    (folder / "inner" / "part.xml").write_text(
+        '<mujoco><compiler meshdir="../.."/><asset><mesh file="secret.xml"/></asset></mujoco>'
+    )
     path = folder / "robot.xml"
     path.write_text(text)
     assert words in sentence(path)
@@ -89,6 +99,13 @@ def test_missing_and_huge_files_are_refused(tmp_path):
     for place in ('<compiler meshdir="{}"/>', '<asset><mesh file="{}"/></asset>'):
         (tmp_path / "mesh.xml").write_text(f"<mujoco>{place.format('x/' * 3000)}</mujoco>")
         assert "give a shorter name" in sentence(tmp_path / "mesh.xml")
+
+
+def test_a_joint_without_a_name_is_not_taken_for_another():
+    second = '<body pos="0 0 .2"><joint name="joint#0"/><geom size=".1"/></body>'
+    text = f'<mujoco><worldbody><body><joint/><geom size=".1"/>{second}</body></worldbody></mujoco>'
+    with pytest.raises(UserError, match="without a name is called as another"):
+        Body.from_mjcf(mujoco.MjModel.from_xml_string(text))
 
 
 def test_models_of_thousands_of_parts_are_refused(tmp_path):

@@ -182,6 +182,7 @@ def test_an_order_of_one_roles_agents_moves_what_others_see_of_them():
     [
         ({"name": "prey"}, "prey, prey; give each"),
         ({"name": "a b"}, "a word of its own"),
+        ({"name": "Prey"}, "Prey, prey; give each"),
         ({"action": None}, "all discrete"),
     ],
 )

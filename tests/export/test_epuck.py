@@ -43,6 +43,12 @@ def test_a_pilot_sees_from_poses_what_the_task_shows(case, tmp_path, monkeypatch
     assert "Observations built from poses were compared" in (tmp_path / "README.md").read_text()
 
 
+def test_a_policy_over_sets_takes_no_rows_and_so_no_pilot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(KINDS, "wheels over sets", ("formation", "mappo", {"network.name": "set"}))
+    export(drawn_policy("wheels over sets"), ["numpy"], tmp_path)
+    assert not (tmp_path / "esp_epuck.py").exists()
+
+
 def test_an_observation_that_is_built_wrongly_is_found() -> None:
     trained = drawn_policy("wheels", sight="nearness")
     scenes = epuck.take_scenes(trained, 300)

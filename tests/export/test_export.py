@@ -227,6 +227,15 @@ def test_an_export_that_cannot_be_written_leaves_the_one_before(tmp_path: Path) 
     assert (tmp_path / "policy.py").read_bytes() == before
 
 
+def test_a_killed_export_leaves_no_description_of_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    trained = drawn_policy("choice")
+    export(trained, ["numpy"], tmp_path)
+    monkeypatch.setattr("esp_cli.export.export.replace_file", lambda path, content: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        export(trained, ["torch"], tmp_path, force=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["README.md"]
+
+
 def test_an_onnx_export_without_its_libraries_names_them(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(ValueError, match=r"needs the package onnx: pip install 'onnx>=1\.17'"):

@@ -120,6 +120,13 @@ def test_agents_that_exchange_messages_choose_among_allowed_actions(tmp_path: Pa
     expected = np.where(mask | ~mask.any(-1, keepdims=True), outputs, -np.inf).argmax(-1)
     assert action.tolist() == expected.tolist()
     assert (action[0], action[1]) == (outputs[0].argmax(), 0)
+    first = {
+        "observation": rows[: program.team],
+        "action_mask": mask[: program.team],
+        "action": expected[: program.team],
+    }
+    (tmp_path / "policy_example.c").write_bytes(c_file.example_source(program, first))
+    assert c_file.example_runs(tmp_path)
     assert onnx_runner(tmp_path / "policy.onnx")(sample)[0].tolist() == expected.tolist()
     through_torch = TorchProgram(program)(torch.from_numpy(rows), action_mask=torch.from_numpy(mask))[0]
     assert through_torch.tolist() == expected.tolist()
