@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
@@ -41,6 +42,8 @@ def unlike_contacts(frame: Frame, match: Match, wrong: float) -> tuple[str, ...]
             unlike = ["shape"] * (gap > wrong)
             unlike += [what for what, x in contacts.items() if h >= 0 and share(x[g], x[h]) > wrong]
             found += [f"{what} of {_name(frame, g)}" for what in unlike]
+            is_field = model.geom_type[g] == mujoco.mjtGeom.mjGEOM_HFIELD
+            found += [f"shape of {_name(frame, g)} (not covered: of a height field its box alone is)"] * is_field
     known = np.flatnonzero(geoms >= 0)
     lost = frame.touching[np.ix_(known, known)] & ~frame.touching[np.ix_(geoms[known], geoms[known])]
     apart = sorted({tuple(sorted(model.geom_bodyid[known[list(pair)]].tolist())) for pair in np.argwhere(lost)})

@@ -62,6 +62,15 @@ def test_contacts_that_no_state_has_are_not_covered():
     assert proof_of(text).unlike == ("contacts with the world (not covered: no state has any)",)
 
 
+def test_heights_of_a_field_are_not_covered():
+    field = '<asset><hfield name="hills" nrow="2" ncol="2" elevation="0 1 2 0" size="5 5 1 1"/></asset>'
+    text = changed(FLOOR, '<geom name="ground" type="hfield" hfield="hills"/>').replace(
+        "<worldbody>", f"{field}<worldbody>"
+    )
+    unlike = ["shape of ground (not covered: of a height field its box alone is)"]
+    assert [what for what in proof_of(text).unlike if "ground" in what] == unlike
+
+
 def test_equalities_that_are_switched_off_are_not_covered():
     text = changed("</mujoco>", '<equality><weld name="dock" body1="pelvis" active="false"/></equality></mujoco>')
     assert proof_of(text).unlike == ("dock (not covered: it is switched off)",)
