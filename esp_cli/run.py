@@ -12,7 +12,7 @@ from __future__ import annotations
 import itertools
 import os
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from numbers import Integral
 from operator import index
@@ -174,13 +174,15 @@ class Run(Shown):
         return TrainedPolicy.read(self.path).transfer(settings or {})
 
 
-def plan(config: RunConfig, init_from: str | os.PathLike[str] | None) -> tuple[RunConfig, Mapping[str, Tensor] | None]:
+def plan(
+    config: RunConfig, init_from: str | os.PathLike[str] | None, note: Callable[[str], object] = lambda _: None
+) -> tuple[RunConfig, Mapping[str, Tensor] | None]:
     """Return the configuration of a new run with what has to be measured, and its first weights, as `train` says."""
     config = prepared(config)
     learner = build_learner(config)
     if init_from is None:
         return config, None
-    initial, weights = weights_to_start(init_from, learner)
+    initial, weights = weights_to_start(init_from, learner, note)
     return config.model_copy(update={"init_from": initial}), weights
 
 

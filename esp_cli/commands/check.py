@@ -168,6 +168,8 @@ def _check_roles(
             if asked is not None or _declares(role):
                 raise
             console.note(str(told))
+    if transforms is not None and not reports:
+        raise NothingToTry(f"no transform can be tried on {spec.name}: '{transforms}' moves no agent of any role")
 
     def show() -> None:
         for report in reports.values():

@@ -66,7 +66,8 @@ def _discovery(
     from esp_cli.checking import check_recorded, check_symmetry
     from esp_cli.checking.recorded import read_transitions
     from esp_cli.training.config import resolve_task_settings
-    from esp_envs.registry import make
+    from esp_cli.training.folder_names import CONFIG
+    from esp_envs.registry import make, task_names
 
     path = Path(what)
     register_named([task, None if path.exists() else what])
@@ -82,9 +83,10 @@ def _discovery(
         with console.watching("check", "elements") as watch:
             return check_recorded(what, spec, data, transforms, watch, seconds)
     name, whole = what, settings
-    if task is not None and not path.is_dir():
+    is_run = path.is_dir() and (what not in task_names() or (path / CONFIG).is_file())
+    if task is not None and not is_run:
         raise UserError(f"--task is for a run, or a file of transitions, and there is no {what}; leave it out")
-    if path.is_dir():
+    if is_run:
         from esp_cli.training.run_folder import RunFolder
         from esp_cli.training.settings import parse_config
 

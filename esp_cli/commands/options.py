@@ -172,7 +172,7 @@ def not_over_a_run(context: typer.Context, path: T) -> T:
     refuse_unwritable(str(path))
     documents = (of.CONFIG, of.STUDY)
     names = (*documents, of.METRICS, of.POLICY, of.INITIAL, of.LOCK, of.STUDY_LOCK)
-    owned = real.is_file() and real.name in (names if context.info_name == "eval" else (*names, of.FINAL))
+    owned = real.name in (names if context.info_name == "eval" else (*names, of.FINAL))
     home = next((folder.parent for folder in real.parents if folder.name == of.CHECKPOINTS), None)
     for folder in (real.parent if owned else None, home):
         if folder and any(begins_with(folder / name, '"format": "esp-') for name in documents):

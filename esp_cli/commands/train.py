@@ -109,9 +109,11 @@ def train(
     trackers = tuple(track or ())
     options.register_named([task], [algo], [network, named.get("network.name")])
     if resume is not None:
-        own = {"task": task, "algo": algo, "network": network or ""}
-        _refuse_beside_resume(context, allowed=[name for name, value in own.items() if ":" in value])
+        given = {"task": task, "algo": algo, "network": network or ""}
+        own = {name: value for name, value in given.items() if ":" in value}
+        _refuse_beside_resume(context, allowed=[*own])
         run = runs.Run(resume)
+        options.refuse_unused([run.config], *([own.get(name, "")] for name in given))
         if options.was_given(context, "device"):
             run.config = run.config.model_copy(update={"device": resolve_device(device)})
         _train(run, trackers, watch, not no_check)

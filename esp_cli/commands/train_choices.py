@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import typer
 
+from esp_cli import console
 from esp_cli.commands.counts import parse_count, parse_seed_list, parse_seeds
 from esp_cli.commands.options import Device, was_given
 from esp_envs.errors import UserError
@@ -37,7 +38,7 @@ def plan_run(
     start = choices.pop("init_from")
     choices["device"] = resolve_device(choices["device"])
     asked = resolve_config(**choices, overrides=settings)
-    config, weights = plan(asked, start)
+    config, weights = plan(asked, start, console.note)
     repeated = None if told is None or was_given(context, "init_from") else told.config
     if repeated and repeated.seeds == config.seeds and repeated.init_from != config.init_from:
         raise UserError(f"{start} holds other weights than the run of {file} started from; add --init-from POLICY")

@@ -7,7 +7,7 @@ import signal
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from types import FrameType
 
 from rich.console import RenderableType
@@ -149,7 +149,8 @@ def stop_requests(sentence: str) -> Iterator[list[int]]:
         if requests:
             raise KeyboardInterrupt
         requests.append(number)
-        note(f"{sentence} (press Ctrl-C again to stop at once)")
+        with suppress(RuntimeError):  # in the middle of a write to standard error nothing else is written there
+            note(f"{sentence} (press Ctrl-C again to stop at once)")
 
     heard = [signal.SIGINT, signal.SIGTERM]
     heard += [signal.SIGHUP] if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN else []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -34,6 +35,10 @@ _GONE: dict[str, dict[str, object]] = {
 }
 """Settings that earlier versions wrote into files, with their defaults: of a task, or the prior."""
 _TOO_DEEP = f"it is nested more than {MAX_NESTING} deep"
+# Parts of a key, bare or quoted, with dots between them. Before the first stands nothing that could belong to it, so
+# that each text is tried a bounded number of times.
+_PART = r"""(?:[\w-]++|"(?:\\.|[^"\\\n])*+"|'[^'\n]*+')"""
+_DEEP_KEY = re.compile(rf"(?<![\w\\-])(?:{_PART}[ \t]*+\.[ \t]*+){{{MAX_NESTING}}}")
 
 
 class Strict(BaseModel):
@@ -234,7 +239,10 @@ def read_table(path: str | os.PathLike[str]) -> dict[str, Any]:
         except UserError as error:
             raise UserError(f"{path} {error}; write TOML into a file whose name ends in .toml") from None
     try:
-        table = tomllib.loads(text.decode("utf-8"))
+        content = text.decode("utf-8")
+        if _DEEP_KEY.search(content):  # tomllib takes time and memory with the square of the parts
+            raise UserError(_TOO_DEEP)
+        table = tomllib.loads(content)
         _refuse_nesting(table)
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path} is not valid TOML: {shortened(str(error))}") from None

@@ -16,7 +16,7 @@ Policy = Any  # what a policy returns: a distribution, or a tensor (logits of di
 
 SAMPLES = 8  # actions drawn where a divergence has no closed form
 # A latent action that a squash sends to the end of its box, and how near to the end, as a share, actions may come
-_FAR, _MARGIN = 30.0, 1e-6
+_FAR, _MARGIN = 1e4, 1e-6
 _GOLDEN = 0.6180339887498949  # multiples of it, without their whole parts, lie evenly in [0, 1)
 _KNOWN = "Categorical, OneHotCategorical, Normal, Independent, or a squashed Normal such as TanhNormal"
 
@@ -43,7 +43,7 @@ def policy_divergence(transform: Transform, there: Policy, here: Policy, samples
     elif _is_squashed(there) and _is_squashed(here):
         inner, own = _bare(there.base_dist), _bare(here.base_dist)
         check_alike("policy", [inner.loc], own.loc)
-        if _commutes(transform, own.loc, here.transforms):
+        if _commutes(transform, own.loc, there.transforms, here.transforms):
             return _normals_apart(transform, inner, own)
         return _samples_apart(transform, there, here, samples)
     if isinstance(there, Tensor) != isinstance(here, Tensor):
@@ -102,13 +102,15 @@ def _normals_apart(transform: Transform, there: td.Normal, here: td.Normal) -> T
 
 
 @torch.no_grad()
-def _commutes(transform: Transform, like: Tensor, squash: list[td.Transform]) -> bool:
-    """Whether turning before a squash is turning after it, tried on latent actions spread over [-2, 2]."""
+def _commutes(transform: Transform, like: Tensor, there: list[td.Transform], here: list[td.Transform]) -> bool:
+    """Whether turning before the squashes is turning after them, tried on latent actions spread over [-2, 2]."""
     spread = torch.arange(like.numel(), device=like.device, dtype=torch.float64).mul_(_GOLDEN).frac_().mul_(4).sub_(2)
     latent = spread.to(like.dtype).view_as(like)
     turned = _pulled(transform, latent)
-    for step in squash:
-        latent, turned = step(latent), step(turned)
+    for step in there:
+        latent = step(latent)
+    for step in here:
+        turned = step(turned)
     return torch.allclose(transform.pull_back(latent), turned, rtol=1e-4, atol=1e-6)
 
 
@@ -119,13 +121,18 @@ def _samples_apart(transform: Transform, there: Policy, here: Policy, samples: i
         density = policy.log_prob(action)
         return density.sum(-1) if density.dim() == action.dim() else density
 
-    low, high = (torch.full_like(here.base_dist.mean, end) for end in (-_FAR, _FAR))
-    for step in here.transforms:
-        low, high = step(low), step(high)
-    margin = max(_MARGIN, 2 * torch.finfo(high.dtype).eps) * (high - low)
-    low, high = low + margin, high - margin
+    box, own = _box(there), _box(here)
     gaps = []
-    for action in (there.rsample().clamp(low, high) for _ in range(samples)):
-        home = transform.pull_back(action).clamp(low, high)
+    for action in (there.rsample().clamp(*box) for _ in range(samples)):
+        home = transform.pull_back(action).clamp(*own)
         gaps.append(transform.values(log_prob(there, action)) - log_prob(here, home))
     return torch.stack(gaps).mean(0)
+
+
+def _box(policy: td.TransformedDistribution) -> tuple[Tensor, Tensor]:
+    """Return the least and the greatest actions of a squashed Normal, a little inside of the ends."""
+    low, high = (torch.full_like(policy.base_dist.mean, end) for end in (-_FAR, _FAR))
+    for step in policy.transforms:
+        low, high = step(low), step(high)
+    margin = (max(_MARGIN, 2 * torch.finfo(high.dtype).eps) * (high - low)).nan_to_num(posinf=0)  # a box without end
+    return low + margin, high - margin

@@ -124,6 +124,13 @@ class CheckedTransform(Transform):
         """Return values per agent, [..., N] or [..., N, 1], to their agents; one per row stays."""
         return self._carried(super().values, values, name)
 
+    def action_values(self, values: Tensor) -> Tensor:
+        """Return values of all discrete actions, [..., N, A], to their agents and actions."""
+        check_tensor("value", values)
+        if values.shape != (needed := (*self.axes, self.num_outputs)):
+            raise UserError(f"value has shape {list(values.shape)}, but {list(needed)} is needed")
+        return self.pull_back(values)
+
     def along(self, x: Tensor, name: str) -> Tensor:
         """Move what goes with its agent: a number as by `per_agent`, or an action mask."""
         check_tensor(name, x)

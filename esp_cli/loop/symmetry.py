@@ -240,7 +240,7 @@ class Symmetry(Draws):
             raise UserError("action_value_loss needs discrete actions; compare the values of continuous ones yourself")
         lead_of(self.spaces, obs)
         here = value(obs) if here is None else here
-        pulled = [g.pull_back(value(g.obs(obs))) for g in self.transforms(obs)]
+        pulled = [g.action_values(value(g.obs(obs))) for g in self.transforms(obs)]
         check_alike("value", pulled, here)
         return mean_counted([value_consistency_loss(x, here) for x in pulled], mask)
 

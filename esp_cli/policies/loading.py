@@ -165,13 +165,17 @@ def open_policy(where: Path, algo: str | None = None, prior: str | None = None) 
     raise UserError(f"{where} does not exist{hint}")
 
 
-def weights_to_start(source: str | os.PathLike[str], learner: Learner) -> tuple[InitialPolicy, dict[str, Tensor]]:
+def weights_to_start(
+    source: str | os.PathLike[str], learner: Learner, note: Callable[[str], object]
+) -> tuple[InitialPolicy, dict[str, Tensor]]:
     """Return what a new run's configuration records of the policy it starts from, and weights [S, ...] for its learner.
 
     They are those of the policy, and where a network is free of counts all that fits. One seed's serve all seeds; as
-    many seeds as the new run has serve one each.
+    many seeds as the new run has serve one each. `note` is told what a user has to know of the policy.
     """
     trained = open_policy(Path(source))
+    for text in trained.notes:
+        note(text)
     config, held, seeds = trained.config, trained.policy.num_seeds, learner.policy.num_seeds
     own, given = learner.policy.state_dict(), {**trained.policy.state_dict(), **trained.further}
     fitting: dict[str, Tensor] = {}

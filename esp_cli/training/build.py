@@ -72,8 +72,10 @@ def first_look(config: RunConfig) -> list[str]:
     findings = list(check(Subject(make_worlds, deadline=time.monotonic() + _LOOK_SECONDS), QUICK))
     if broken := [finding.broken for finding in findings if finding.broken]:
         return [f"{config.task} breaks a promise: {'; '.join(broken)}; see 'esp check task {config.task}'"]
-    kept = ", ".join(finding.promise for finding in findings if not finding.not_asked)
-    return [f"looked at {config.task}: {kept}; 'esp check task {config.task}' looks longer"]
+    late = [finding.promise for finding in findings if finding.not_covered]
+    kept = [finding.promise for finding in findings if not (finding.not_asked or finding.not_covered)]
+    told = ", ".join(kept or ["nothing to its end"]) + (f"; there was no time for: {', '.join(late)}" if late else "")
+    return [f"looked at {config.task}: {told}; 'esp check task {config.task}' looks longer"]
 
 
 def spec_of(config: RunConfig) -> TaskSpec:

@@ -87,8 +87,7 @@ class RunFolder:
             with folder.lock():
                 # a second time, as another process may have made a run here in between
                 _refuse_taken(path)
-                for file in (folder.policy_path, folder.initial_path, *folder.checkpoints(), folder.metrics_path):
-                    file.unlink(missing_ok=True)
+                folder.initial_path.unlink(missing_ok=True)
                 (path / CHECKPOINTS).mkdir(exist_ok=True)
                 os.close(open_own(folder.metrics_path, os.O_WRONLY))
                 if initial is not None:
@@ -244,4 +243,6 @@ def _is_leftover(entry: Path) -> bool:
         return entry.is_dir() and not any(entry.iterdir())
     if entry.name == METRICS:
         return entry.is_file() and entry.stat().st_size == 0
-    return entry.name in (LOCK, INITIAL) or entry.name.startswith(TEMPORARY_PREFIX)
+    if entry.name == INITIAL:  # a killed process left its lock beside it
+        return (entry.parent / LOCK).exists()
+    return entry.name == LOCK or entry.name.startswith(TEMPORARY_PREFIX)

@@ -211,15 +211,15 @@ def open_trackers(names: Sequence[str], run: TrackedRun, tell: Callable[[str], N
 def scalars(values: Row, seeds: tuple[int, ...]) -> Iterator[tuple[str, int | None, float]]:
     """Yield name, seed and number of a row's metrics: the mean over seeds, where the seed is None, then each seed's.
 
-    A metric is left out where any seed has no number, as the mean would be of other seeds than before.
+    The mean is left out where any seed has no number, as it would be of other seeds than before.
     """
     for name, value in values.items():
         numbers = value if isinstance(value, list) else [value]
-        if not numbers or any(number is None for number in numbers):
-            continue
-        yield name, None, sum(numbers) / len(numbers)
+        known = [number for number in numbers if number is not None]
+        if numbers and len(known) == len(numbers):
+            yield name, None, sum(known) / len(known)
         if len(numbers) == len(seeds) > 1:
-            yield from ((name, seed, number) for seed, number in zip(seeds, numbers, strict=True))
+            yield from ((name, seed, x) for seed, x in zip(seeds, numbers, strict=True) if x is not None)
 
 
 def named(values: Row, seeds: tuple[int, ...]) -> dict[str, float]:

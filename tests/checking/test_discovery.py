@@ -209,7 +209,7 @@ def test_a_file_that_does_not_fit_is_refused(tmp_path: Path, changes, sentence: 
     assert sentence in said
 
 
-def test_what_is_no_file_run_or_task_is_refused(tmp_path: Path) -> None:
+def test_what_is_no_file_run_or_task_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     junk = tmp_path / "junk.npz"
     junk.write_bytes(b"PK\x03\x04 no archive")
     assert "is not an intact .npz file" in refused("discover", junk, "--task", "navigation")
@@ -229,6 +229,9 @@ def test_what_is_no_file_run_or_task_is_refused(tmp_path: Path) -> None:
     assert "unknown task 'nowhere'" in refused("discover", "nowhere")
     assert "there is no navigation; leave it out" in refused("discover", "navigation", "--task", "navigation")
     assert "is no run folder" in refused("discover", tmp_path, "--task", "navigation")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "navigation").mkdir()
+    assert "unknown setting 'task.nothing'" in refused("discover", "navigation", "--set", "task.nothing=1")
     assert "leave --logs out" in refused("discover", recorded(tmp_path), "--logs", *navigation)
 
 

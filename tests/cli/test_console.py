@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import signal
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from pydantic import BaseModel
 
 from esp_cli import console
 from esp_cli.console import TrainingProgress, format_count, format_duration, format_interval, format_mean, format_span
+from esp_cli.console.progress import stop_requests
 from esp_cli.files.formatting import file_name, format_exactly
 
 
@@ -100,6 +102,16 @@ def test_a_full_disk_behind_standard_error_ends_nothing() -> None:
     assert (done.returncode, done.stdout) == (0, "done\n")
     done = shell(f'PYTHON "{code.replace("note", "say")}" >/dev/full')
     assert done.returncode != 0, "negative control: results have to be written"
+
+
+def test_a_request_to_stop_counts_where_it_cannot_be_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+    def busy(text: str) -> None:
+        raise RuntimeError("reentrant call")
+
+    monkeypatch.setattr("esp_cli.console.progress.note", busy)
+    with stop_requests("stopping") as requests:
+        signal.raise_signal(signal.SIGTERM)
+    assert requests == [signal.SIGTERM]
 
 
 def test_what_a_terminal_cannot_show_is_written_otherwise() -> None:

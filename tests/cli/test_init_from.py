@@ -55,6 +55,13 @@ def test_a_run_resumes_without_the_policy_that_it_started_from(finished: Path, c
     assert "does not hold the policy that the run started from" in refused("train", "--resume", tmp_path / "cut")
 
 
+def test_what_a_user_has_to_know_of_the_policy_is_said(copied: Path, tmp_path: Path) -> None:
+    (newest,) = (copied / "checkpoints").iterdir()
+    newest.write_bytes(newest.read_bytes()[:-5])
+    words = ["train", "--print-config", *TINY_OPTIONS, "--network", "mlp", "--seeds", 2, "--init-from", copied]
+    assert f"taking {copied / 'policy.safetensors'}" in esp(*words).stderr
+
+
 def test_a_policy_that_does_not_fit_is_one_sentence_and_leaves_no_folder(finished: Path, tmp_path: Path) -> None:
     out = ["--network", "mlp", "--out", tmp_path / "run", "--init-from"]
     wider = refused("train", "--seeds", 2, "--set", "network.hidden=[9]", *out, finished)

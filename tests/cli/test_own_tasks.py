@@ -82,6 +82,7 @@ def test_a_run_alone_imports_nothing_and_says_what_to_add(folder: Path, words: l
         ["export", "navigation", "-f", "numpy", "-o", "e"],
         ["report", "plain"],
         ["discover", "plain"],
+        ["train", "--resume", "plain"],
     ],
     ids=lambda words: words[0],
 )

@@ -159,6 +159,8 @@ def test_what_a_run_or_a_study_needs_is_not_overwritten_by_a_report(copied: Path
     for file in (copied / "final-evaluation.json", copied / "checkpoints" / "new" / "table.csv"):
         esp("eval", copied, "--episodes", "4", "--json", copied / "final-evaluation.json")
         assert f"{file} belongs to the run or study in {copied};" in refused("report", copied, option, file)
+    (copied / "policy.safetensors").unlink()
+    assert "belongs to the run" in refused("report", copied, option, copied / "policy.safetensors"), "it is to come"
     for file in (copied / "all.csv", tmp_path / "config.json"):
         file.touch()
         esp("report", copied, option, file)

@@ -556,6 +556,9 @@ def test_a_training_begins_with_a_note_of_what_is_broken(name, sentence, tmp_pat
         assert re.search(expected, note)
         assert "esp check task" in note
     assert first_look(resolve_config("navigation", "mappo", steps=8)) == []
+    monkeypatch.setattr("esp_cli.training.build._LOOK_SECONDS", -1.0)
+    (note,) = first_look(resolve_config(register(task()), "mappo", steps=8, overrides=SMALL))
+    assert re.search("nothing to its end; there was no time for: observations .*, the same seed .* run; 'esp", note)
 
 
 def test_what_one_start_or_one_step_cannot_show_is_not_asked():

@@ -406,6 +406,8 @@ def test_a_role_of_which_nothing_can_be_tried_hides_no_verdict_of_another() -> N
     lame = esp("check", "symmetry", CREW, "--set", "task.speeds=[0.1,0.5]", "--json", "-", code=1)
     assert json.loads(lame.stdout)["car"]["report"]["elements"][0]["fields"][0]["outcome"] == "broken"
     assert "no transform can be tried on car" in refused("check", "symmetry", CREW, "--transforms", "rot90")
+    pair = ["predator-prey", *(f"--set=task.{one}" for one in ("control=both", "num_predators=1"))]
+    assert "'agents' moves no agent of any role" in refused("check", "symmetry", *pair, "--transforms", "agents")
 
 
 def test_a_default_that_is_made_is_on_the_card() -> None:

@@ -5,7 +5,8 @@ import json
 import pytest
 from pydantic import BaseModel, ConfigDict, Field
 
-from esp_cli.files.documents import MAX_DOCUMENT_BYTES, MAX_NESTING, DocumentFormat, parse_value
+from esp_cli.files import documents
+from esp_cli.files.documents import MAX_DOCUMENT_BYTES, MAX_NESTING, DocumentFormat, parse_value, read_table
 from esp_envs.errors import UserError
 
 TOY = DocumentFormat("esp-toy", 2, "a toy")
@@ -78,3 +79,15 @@ def test_values_at_the_bounds_are_read():
     assert parse_value(str(2**63 - 1)) == 2**63 - 1
     with pytest.raises(ValueError, match="64 bits"):
         parse_value(str(2**63))
+
+
+@pytest.mark.parametrize("part", ["a", " a\t", '"a.b"', '"\\""', "'a \\'"])
+@pytest.mark.parametrize("line", ["{} = 1", "[{}]", "[[{}]]", "a = {{b = 1, {} = 1}}"])
+def test_a_deep_key_of_toml_is_refused_before_it_takes_time_and_memory(tmp_path, monkeypatch, part, line):
+    file = tmp_path / "a.toml"
+    file.write_text(line.format(".".join([part] * (MAX_NESTING - 2))))  # a list of tables is two more
+    assert read_table(file)
+    monkeypatch.setattr(documents.tomllib, "loads", pytest.fail)
+    file.write_text(line.format(".".join([part] * (MAX_NESTING + 1))))
+    with pytest.raises(UserError, match="is not valid TOML: it is nested more than 64 deep"):
+        read_table(file)

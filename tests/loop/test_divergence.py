@@ -86,6 +86,24 @@ def test_a_squash_that_commutes_leaves_the_divergence_exact(size: float) -> None
         assert got.isfinite().all(), "a turned action outside of the box is clipped to it"
 
 
+def test_a_squash_that_depends_on_the_state_counts() -> None:
+    g, unit, uneven = element("rot90", FORCE), normal(torch.zeros(64, 2), torch.ones(64, 2)), torch.tensor([0.5, 1.0])
+    for others in ([], [td.TanhTransform()]):
+
+        def scaled(by: Tensor, others: list[td.Transform] = others) -> td.TransformedDistribution:
+            return td.TransformedDistribution(unit, [*others, td.AffineTransform(0.0, by.expand(64, -1))])
+
+        assert policy_divergence(g, scaled(uneven.flip(-1)), scaled(uneven)).abs().max() < 1e-5, "it turns"
+        for there, here in ((0.5, 1.0), (40.0, 1.0)):
+            one, other = torch.tensor([there]), torch.tensor([here])
+            gap = policy_divergence(g, scaled(one), scaled(other), samples=99)
+            assert gap.isfinite().all(), "what is outside of a box is clipped to it"
+            assert gap.mean() > 0.3
+            if not others:
+                exact = policy_divergence(g, normal(unit.loc, one.expand(64, 2)), normal(unit.loc, other.expand(64, 2)))
+                torch.testing.assert_close(gap.mean(), exact.mean(), rtol=0.1, atol=0)
+
+
 @pytest.mark.slow
 def test_samples_agree_with_the_closed_form_where_there_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
     torch.manual_seed(0)

@@ -215,6 +215,9 @@ def test_action_values_are_pulled_back_before_they_are_compared() -> None:
     assert quarter().action_value_loss(lambda o: q * 0 + o[..., 2:], obs).item() == 0
     with pytest.raises(ValueError, match="action_value_loss needs discrete actions"):
         Symmetry(observation=SEEN, action=FORCE).action_value_loss(lambda _: q, obs)
+    team, three = Symmetry(observation=SEEN, action=MOVES, group="d4*agents", num_agents=3), random(3, 3, 3)
+    with pytest.raises(ValueError, match=r"value has shape \[3, 4\], but \[3, 3, 4\] is needed"):
+        team.action_value_loss(lambda o: o[:, 0, [0, 0, 1, 1]], three)
 
 
 def test_a_masked_row_does_not_count_and_a_known_answer_is_not_asked_again() -> None:

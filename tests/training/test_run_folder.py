@@ -67,9 +67,10 @@ def test_create_refuses_an_existing_run_and_leaves_it_alone(folder):
     assert names(folder) == ["step-000000000100.safetensors"]
 
 
-@pytest.mark.parametrize(
-    "name", ["thesis.tex", "policy.safetensors", "metrics.jsonl", "checkpoints/best", "config.json"]
-)
+FOREIGN = ("thesis.tex", "policy.safetensors", "initial-policy.safetensors", "metrics.jsonl", "checkpoints/best")
+
+
+@pytest.mark.parametrize("name", [*FOREIGN, "config.json"])
 def test_create_never_touches_a_foreign_folder(tmp_path, name):
     file = tmp_path / name
     file.parent.mkdir(exist_ok=True)
@@ -84,9 +85,11 @@ def test_create_takes_an_empty_or_half_made_folder(tmp_path):
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "metrics.jsonl").touch()
     (tmp_path / "run.lock").write_text("{}")
+    (tmp_path / "initial-policy.safetensors").touch()
     (tmp_path / f"{TEMPORARY_PREFIX}config.json-12").write_text("{")
     assert RunFolder.create(tmp_path, CONFIG).config == CONFIG
     assert not list(tmp_path.glob(f"{TEMPORARY_PREFIX}*"))
+    assert not (tmp_path / "initial-policy.safetensors").exists()
 
 
 def test_create_on_a_file_or_without_permission_is_one_sentence(tmp_path):

@@ -25,9 +25,10 @@ ROOT = Path(__file__).parents[2]
 NAME = "eval/return_greedy"
 
 
-def test_a_metric_is_a_mean_and_one_number_per_seed_and_left_out_where_a_seed_has_none() -> None:
+def test_a_metric_is_a_mean_which_a_seed_without_a_number_leaves_out_and_one_number_per_seed() -> None:
     row = {"a": [1.0, 3.0], "b": 0.5, "c": [None, 1.0], "d": None}
-    assert list(scalars(row, (3, 7))) == [("a", None, 2.0), ("a", 3, 1.0), ("a", 7, 3.0), ("b", None, 0.5)]
+    means = [("a", None, 2.0), ("a", 3, 1.0), ("a", 7, 3.0), ("b", None, 0.5)]
+    assert list(scalars(row, (3, 7))) == [*means, ("c", 7, 1.0)]
     assert list(scalars({"a": [1.0]}, (3,))) == [("a", None, 1.0)], "one seed is its own mean"
 
 
