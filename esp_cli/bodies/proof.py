@@ -28,8 +28,8 @@ _NO_CONSTRAINTS, _NO_SENSORS, _NO_CONTACTS = (
     int(getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")) for name in ("CONSTRAINT", "SENSOR", "CONTACT")
 )
 _NO_LIMITS = int(mujoco.mjtDisableBit.mjDSBL_LIMIT | mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS) | _NO_CONTACTS
-_PARTS: tuple[list[int], ...] = ([2, 3, 5], [2], [], [])
-"""Where z, (roll, pitch) and yaw begin behind (x, y) in the degrees of freedom of a joint, by its type."""
+_PARTS: tuple[list[int], ...] = ([3, 5], [2], [], [])
+"""Where (roll, pitch) and yaw begin behind (x, y, z) in the degrees of freedom of a joint, by its type."""
 Sample = tuple[Floats, Floats, Floats, Floats]  # qpos, qvel, ctrl and forces on the degrees of freedom
 
 
@@ -39,8 +39,8 @@ class Proof:
 
     Attributes:
         joints: [joints] the root mean square gap of the accelerations of each joint over theirs, without constraints;
-            of a free or ball joint the worst of (x, y), z, (roll, pitch) and yaw, each over its own size; of a model
-            with equalities, as of closed loops and mimic joints, the larger of those with and without them.
+            of a free or ball joint the worst of (x, y, z), with gravity, (roll, pitch) and yaw, each over its own
+            size; of a model with equalities, as of closed loops and mimic joints, the larger of those with and without.
         planted: [joints] the smallest gap of mistakes planted at each.
         median: of the states' gaps: |difference| / |accelerations|.
         constraints: the same median with limits, friction and equalities.

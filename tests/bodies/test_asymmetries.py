@@ -1,10 +1,14 @@
 """Asymmetries that few states of a robot show, or none: each is found, and robots without it stay exact."""
 
 import mujoco
+import numpy as np
 import pytest
 
 from esp_cli import Body
-from esp_cli.bodies.proof import Proof
+from esp_cli.bodies.deriving import derive
+from esp_cli.bodies.frame import Frame
+from esp_cli.bodies.proof import Proof, _gaps
+from esp_cli.symmetry.plane import PlaneElement
 from esp_envs.errors import UserError
 from tests.bodies.models import biped
 
@@ -48,6 +52,17 @@ def drone(spins: tuple[int, ...]) -> str:
 @pytest.mark.parametrize(("spins", "group"), [((1, -1, -1, 1), "d2"), ((1, 1, -1, -1), "flip-y"), ((1,) * 4, "c2")])
 def test_a_wrong_yaw_does_not_drown_in_lift_and_roll(spins, group):
     assert body_of(drone(spins)).group == group
+
+
+@pytest.mark.parametrize(("dof", "size", "gap"), [(0, 0.1, 0.01), (2, 0.1, 0.01), (3, 0.6, 0.1), (5, 0.1, 0.05)])
+def test_a_free_base_is_judged_beside_gravity_beside_its_tumbling_and_beside_its_yaw(dof, size, gap):
+    frame = Frame(mujoco.MjModel.from_xml_string(biped()), 100)
+    match = derive(frame, PlaneElement(mirrored=True))
+    here = np.ones((1, frame.model.nv))
+    here[0, :6] = 0, 0, -10, 6, 0, 2  # falls and tumbles: a share of 10, 6 or 2
+    there = here @ match.qvel.T
+    there[0, dof] += size
+    assert _gaps(frame, match, here, there)[0][0] == pytest.approx(gap)
 
 
 @pytest.mark.parametrize("floor", [FLOOR, '<geom type="box" size="9 9 0.01"/>'])
