@@ -127,14 +127,14 @@ class Body:
         if np.any(getattr(model, "actuator_ctrlnum", 1) != 1):
             raise UserError("the model has actuators of no or several controls; give one with a control for each")
         self, frame = cls([], {}), Frame(model, seconds)
-        found, self.refused = find(frame, tolerated)
-        self.found = {element.name: one for element, one in found.items()}
-        matches = {element: one.match for element, one in found.items()}
         names = {frame.name("joint", j): j for j in range(model.njnt) if j != frame.base}
         controls = {frame.name("actuator", a): slice(a, a + 1) for a in range(model.nu)}
         limbs = {frame.name("body", b): slice(b, b + 1) for b in range(model.nbody)}
         if len(names) + len(controls) + len(limbs) < model.njnt - (frame.base is not None) + model.nu + model.nbody:
             raise UserError("a joint, actuator or body without a name is called as another is; give each a name")
+        found, self.refused = find(frame, tolerated)
+        self.found = {element.name: one for element, one in found.items()}
+        matches = {element: one.match for element, one in found.items()}
         self._set(
             Parts("joints", {n: frame.qpos_of(j) for n, j in names.items()}, {g: m.qpos for g, m in matches.items()}),
             Parts("joints", {n: frame.dofs_of(j) for n, j in names.items()}, {g: m.qvel for g, m in matches.items()}),

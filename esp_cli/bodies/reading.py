@@ -103,7 +103,8 @@ def _inspected(path: Path, allowed: Path) -> str:
             times *= math.prod(map(_whole, element.attrib.get("count", "1").split()))
         elements += times
         spans = [_whole(word) for name in _AREA if (word := element.attrib.get(name))]
-        cells += times * math.prod(spans * 2 if len(spans) == 1 else spans) * bool(spans)  # one spans a square
+        if spans:
+            cells += times * math.prod(spans if len(spans) > 1 else spans * 2)  # one spans a square
         if elements > MOST_ELEMENTS or depth > MOST_DEPTH:
             raise UserError(f"{path} has more than {MOST_ELEMENTS} elements, or nests too deep")
         if cells > MOST_CELLS:

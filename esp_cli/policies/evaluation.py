@@ -129,10 +129,11 @@ def play_references(config: RunConfig, names: Sequence[str], episodes: int) -> d
     return anchors
 
 
-def blind_anchor(config: RunConfig) -> dict[str, float]:
-    """Return the mean return of the task's policy that sees nothing, by its name; none where the task has none."""
+def blind_anchor(config: RunConfig, version: int) -> dict[str, float]:
+    """Return the mean return of a task's policy that sees nothing, by its name; none where this version has none."""
     config = config.model_copy(update={"seeds": config.seeds[:1], "device": "cpu"})
-    if BLIND not in build_environment(config, 1, _STREAM, "shape").heuristics:
+    world = build_environment(config, 1, _STREAM, "shape")
+    if BLIND not in world.heuristics or world.spec.version != version:
         return {}
     return {BLIND: float(_play_heuristic(config, BLIND, _BLIND_EPISODES).returns.mean())}
 

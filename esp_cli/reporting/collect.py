@@ -132,8 +132,7 @@ def collect_runs(
     at = _compared_at(curves, at)
     curves = [_thinned(curve, at, max(map(_apart, curves))) for curve in curves]
     first, *_ = curves
-    today = first.spec.version == spec_of(first.config.of_one_seed()).version
-    floor = blind_anchor(first.config) if today else {}
+    floor = blind_anchor(first.config, first.spec.version) if len(curves) > 1 else {}
     cells, states, by_name = [], {}, {}
     for step in at:
         for k, curve in enumerate(curves):
@@ -248,6 +247,7 @@ def _results(study: Study, states: Mapping[str, _State], mode: Mode, thresholds:
 def _cell(study: Study, cell: Cell, state: _State, mode: Mode, config: Mapping[str, Any]) -> CellResult:
     curve, kind, final = state.curve, kind_of(study.kind), state.final
     compared = curve.until(state.at) if curve is not None and state.at is not None else curve
+    anchors = {name: round(value, _DIGITS) for name, value in (final.anchors if final else state.floor).items()}
     fields: dict[str, Any] = {}
     if final is not None:
         fields = {
@@ -255,7 +255,7 @@ def _cell(study: Study, cell: Cell, state: _State, mode: Mode, config: Mapping[s
             "task_version": final.task_version,
             "convention": final.convention,
             "returns": {"greedy": _rounded(final.greedy.per_seed), "stochastic": _rounded(final.stochastic.per_seed)},
-            "anchors": {name: round(value, _DIGITS) for name, value in final.anchors.items()},
+            "anchors": anchors,
             "roles": final.roles,
             "metrics": dict(zip(final.metrics, _rounded(final.metrics.values()), strict=True)),
         }
@@ -271,7 +271,7 @@ def _cell(study: Study, cell: Cell, state: _State, mode: Mode, config: Mapping[s
             "convention": compared.spec.convention,
             "episodes": cell.config.evaluation.episodes,
             "returns": {mode: _rounded(compared.values[-1])},
-            "anchors": {name: round(value, _DIGITS) for name, value in state.floor.items()},
+            "anchors": anchors,
         }
     status = "finished" if fields else "unfinished" if curve is not None else "not run"
     if fields and compared is not None:

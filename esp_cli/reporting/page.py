@@ -174,12 +174,15 @@ def _outcome(material: Material) -> list[str]:
     if pairs and kind_of(results.kind).benchmark:
         ranked = [_ranking(panel, results) for panel in dict.fromkeys(cell.panel for cell, _ in pairs)]
         return [*ranked, *_too_few(pairs), *left_out]
-    texts = _count(pairs) if pairs else [_returns(results, cell) for cell in finished[:2]]
-    if finished and not pairs:
-        alone = any(cell.reference for cell in finished)
-        texts += [f"The table has {len(finished) - 2} more."] if len(finished) > 2 else []
-        texts += ["Nothing is compared: the reference of no run has a return here."] if alone else []
+    texts = _count(pairs) if pairs else _uncompared(results, finished)
     return [*texts, *left_out] or ["No run has a return yet."]
+
+
+def _uncompared(results: Results, finished: Sequence[CellResult]) -> list[str]:
+    """State the returns of runs of which none has its reference beside it."""
+    more = [f"The table has {len(finished) - 2} more."] if len(finished) > 2 else []
+    alone = ["Nothing is compared: the reference of no run has a return here."]
+    return [_returns(results, cell) for cell in finished[:2]] + more + alone * any(c.reference for c in finished)
 
 
 def _ranking(panel: str, results: Results) -> str:
