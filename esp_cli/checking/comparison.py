@@ -7,8 +7,8 @@ from L_g s with K_g a give Y and Y'. The energy distance
 
 is 0 if and only if both have one distribution (eq. 5 and 6), for noise of any kind. A random prey or a noisy sensor is
 thus no false alarm, and no task has to turn its own noise along. It is small, though, where only means or spreads
-differ: twice the deviation gives 0.06 deviations. So means are compared by themselves, and spreads by Gini's mean
-difference, E |X - X'| = 2 sigma / sqrt(pi) of normal chance.
+differ: twice the deviation gives 0.06 deviations. So means are compared by themselves, spreads by Gini's mean
+difference, E |X - X'| = 2 sigma / sqrt(pi) of normal chance, and skewness by how often three runs lean to one side.
 
 Two cases need no statistics. A field without chance is judged state by state: one that differs by more than rounding is
 a proof. And where a run from the images that meets the chance of X gives X itself, both have one distribution, too.
@@ -90,7 +90,9 @@ def beside_what_is_seen(name: str, sides: Sequence[Outcomes], near: Outcomes) ->
     is_clear = (_ROUNDINGS * (rows[0] - rows[-1]).abs() <= tolerance).all(1)
     clear = _halves([side[is_clear] for side in rows[:-1]])
     samples = _excess(lambda gap: (gap.abs() > tolerance).any(-1, keepdim=True).double(), *clear)
-    share, error = float(samples.mean()), float(samples.std()) / max(1, len(samples)) ** 0.5
+    if len(samples) < 2:
+        return None
+    share, error = float(samples.mean()), float(samples.std()) / len(samples) ** 0.5
     return FieldVerdict(name, "broken", share, error, share=share) if share > max(SIGNIFICANT * error, FEW) else None
 
 
@@ -117,6 +119,7 @@ def by_distances(
         tests += [_excess(distance, here, there) for distance in distances]
         tests.append(_over(lambda gap: gap, product(here, there)))
         tests.append((_within(Tensor.abs, here) - _within(Tensor.abs, there)) * _OF_GINI)
+        tests.append(_lean(here) - _lean(there))
     samples = torch.cat(tests, 1).double()
     if worlds is not None:
         _, worlds, counts = worlds[known].unique(return_inverse=True, return_counts=True)
@@ -192,6 +195,16 @@ def _over(distance: Distance, pairs: Iterable[tuple[Tensor, Tensor]]) -> Tensor:
 
 def _within(distance: Distance, runs: Sequence[Tensor]) -> Tensor:
     return _over(distance, combinations(runs, 2))
+
+
+def _lean(runs: Sequence[Tensor]) -> Tensor:
+    """Return of three runs how often their mean is above their median, less how often below [M, D].
+
+    That is 0 on average where chance is symmetric about its centre (the triples test; Randles et al., 1980, JASA 75).
+    """
+    threes = [torch.stack(three) for three in combinations(runs, 3)]
+    above = torch.stack([three.mean(0) - three.median(0).values for three in threes])
+    return torch.where(above.abs() > NEGLIGIBLE, above.sign(), 0.0).mean(0)
 
 
 def _excess(distance: Distance, here: Sequence[Tensor], there: Sequence[Tensor]) -> Tensor:

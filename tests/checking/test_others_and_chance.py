@@ -14,6 +14,7 @@ from esp_envs import BatchedTask, Field, Kind, generators_for, layout, make, reg
 from esp_envs.base import Step
 from esp_envs.spec import TaskSpec
 from esp_envs.views import OthersAtRandom, RoleView, worlds_of_role
+from tests.checking.faults import Fault, with_fault
 from tests.envs.chase import STEPS, Chase
 from tests.envs.mpe_roles import WorldComm
 
@@ -233,11 +234,32 @@ def sides(*rows):
 def test_chance_of_another_spread_is_broken_by_the_difference_of_deviations():
     """Of +-1 the mean difference is 1, of +-2 it is 2; over the field's deviation, sqrt(5 / 2), times sqrt(pi) / 2."""
     g = torch.Generator().manual_seed(0)
-    x, x2, y, y2 = (torch.randint(2, (4096, 1), generator=g) * 2.0 - 1 for _ in range(4))
-    found = by_distances("wind", sides(x, x2, 2 * y, 2 * y2))
+    coins = [torch.randint(2, (4096, 1), generator=g) * 2.0 - 1 for _ in range(8)]
+    found = by_distances("wind", sides(*coins[:4], *(2 * coin for coin in coins[4:])))
     assert found.outcome == "broken"
     assert found.gap == pytest.approx((math.pi / 4 / 2.5) ** 0.5, abs=0.03)
-    normal = [torch.randn(4096, 1, generator=g) for _ in range(4)]
+    normal = [torch.randn(4096, 1, generator=g) for _ in range(8)]
     assert by_distances("wind", sides(*normal)).outcome == "holds"
-    first, second, *others = normal
-    assert by_distances("wind", sides(first, second, *(1.3 * other for other in others))).outcome == "broken"
+    assert by_distances("wind", sides(*normal[:4], *(1.3 * one for one in normal[4:]))).outcome == "broken"
+
+
+def test_skewed_chance_is_broken_by_how_often_three_runs_lean_to_a_side():
+    """Of numbers that are -1 with 3/4 and 3 with 1/4, three lean up if one is 3 (27/64) and down if two are (9/64)."""
+    g = torch.Generator().manual_seed(0)
+    rare = [3.0 - 4 * (torch.rand(4096, 1, generator=g) < 0.75) for _ in range(8)]
+    found = by_distances("wind", sides(*rare[:4], *(-one for one in rare[4:])))
+    assert (found.outcome, found.gap) == ("broken", pytest.approx(2 * 18 / 64, abs=0.03))
+    assert by_distances("wind", sides(*rare)).outcome == "holds"
+
+
+@pytest.mark.slow
+def test_gusts_that_are_skewed_along_one_axis_break_its_mirror_alone():
+    """Four exponential numbers less 4 have mean 0, and a sum that is told from its mirror image by skewness alone."""
+    g = torch.Generator().manual_seed(0)
+
+    def pushed(action):
+        gust = torch.empty(4, *action.shape[:-1]).exponential_(generator=g).sum(0) - 4.0
+        return 0.5 * action + torch.stack([0.1 * gust, torch.zeros_like(gust)], -1)
+
+    report = check_symmetry(with_fault("navigation", {"actions": "continuous"}, Fault(done=pushed)), "flip-y,flip-x")
+    assert {element.element: element.outcome for element in report.elements} == {"flip-y": "broken", "flip-x": "holds"}
