@@ -252,8 +252,11 @@ def train(
     if not isinstance(steps, Integral):
         raise UserError(f"steps are a whole number, not {steps!r}; write for example steps=100_000")
     asked = resolve_config(name, algorithm, preset, index(steps), numbers, resolve_device(device), settings)
-    config, weights = plan(asked, init_from)
+    notes: list[str] = []
+    config, weights = plan(asked, init_from, notes.append)
     require(track)
     run = begin(config, weights, out)
-    run.train(listener, track, check)
+    with run.trainer(track, check) as trainer:
+        trainer.notes[:0] = notes
+        trainer.run(listener or (lambda _: True))
     return run

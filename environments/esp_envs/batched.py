@@ -105,7 +105,7 @@ class BatchedTask(Environment):
         return self._seen()
 
     def step(self, action: Tensor) -> Step:
-        require_shape("joint action", action, self.action_shape)
+        self._require_action(action)
         reward, metrics = self._play(action)
         reached, horizon = self._seen(), self.spec.horizon
         terminated = self._switched("_ended", "terminates", self._worlds_shape)

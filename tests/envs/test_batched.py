@@ -194,6 +194,15 @@ def test_tensors_of_another_shape_are_refused(method: str, value, sentence: str)
         play()
 
 
+@pytest.mark.parametrize("choice", [torch.tensor(5), torch.tensor(-1), torch.tensor(1.0)])
+def test_choices_that_are_none_are_refused(choice: torch.Tensor) -> None:
+    env = make("navigation", 2, [0])
+    env.reset()
+    env.step(torch.full(env.action_shape, 4))
+    with pytest.raises(ValueError, match="joint action of navigation holds other than the indices 0 to 4"):
+        env.step(choice.expand(env.action_shape))
+
+
 @pytest.mark.parametrize("given", ["go", ["go"], (1,)])
 def test_heuristics_are_a_tuple_of_names(given) -> None:
     told = re.escape(f"Odd.heuristics is {given!r}; give a tuple of names, as ('nearest',)")

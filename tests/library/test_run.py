@@ -2,6 +2,7 @@
 
 import math
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -107,6 +108,17 @@ def test_a_listener_that_says_nothing_stops_nothing(tmp_path: Path) -> None:
         "navigation", steps=np.int64(200), settings=SMALL, out=tmp_path / "cn", listener=lambda p: told.append(p.step)
     ).is_complete
     assert told == [0, 100, 200]
+
+
+def test_a_listener_is_told_of_the_policy_that_a_run_starts_from(run: Run, tmp_path: Path) -> None:
+    begun = shutil.copytree(run.path, tmp_path / "begun")
+    for file in (begun / "checkpoints").iterdir():
+        file.write_bytes(file.read_bytes()[:-5])
+    told: list[Progress] = []
+    later = tmp_path / "later"
+    train(steps=100, seeds=(3, 7), settings=SMALL, listener=told.append, out=later, init_from=begun)
+    assert any("taking" in note and "policy.safetensors" in note for note in told[0].notes)
+    assert not any(news.notes for news in told[1:])
 
 
 def test_a_run_is_evaluated_and_drawn_as_by_the_commands(run: Run, tmp_path: Path) -> None:

@@ -121,7 +121,7 @@ class ParallelTask(CopyHooks, Environment):
         return self._seen()
 
     def step(self, action: Tensor) -> Step:
-        require_shape("joint action", action, self.action_shape)
+        self._require_action(action)
         copies = self._started()
         board = copies.board
         board.action[:] = self.spec.admissible(action).flatten(0, 1).cpu().numpy()

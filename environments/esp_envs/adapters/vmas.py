@@ -141,7 +141,7 @@ class VmasTask(Environment):
         return _joined([self._begin(s) for s in range(self.num_seeds)])
 
     def step(self, action: Tensor) -> Step:
-        require_shape("joint action", action, self.action_shape)
+        self._require_action(action)
         force = self.spec.admissible(action) * self._range.unsqueeze(-1)
         reached, following, rewards, ends, measured = [], [], [], [], []
         self._time += 1
