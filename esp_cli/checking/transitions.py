@@ -5,7 +5,7 @@ the images of these under an element by e(gx, gy). If starts, policy, dynamics a
 and its image have one distribution, so any predictor errs on both alike. The gap squared is the difference
 (e(gx, gy) - e(x, y)) / variance; of an exact predictor it is the mean squared difference of a step from the image and
 the step's image. Squares of what changes, and products of neighbours in a field, are predicted too, which shows where
-noise is not symmetric; of the reward only the mean matters.
+noise is not symmetric, and so does how often a number lies above what is expected; of the reward only the mean matters.
 
 A predictor that knows nothing errs alike everywhere. So breakings of the tolerance's size are planted in the same data
 (see `controls`): d h(x) is added to a field, for functions h that the element changes. An element holds where each of
@@ -42,6 +42,9 @@ _HIDES, _CARRIES = 0.25, 0.9
 hides what is usual, from the second on what is left is too little to say that rewards hold."""
 _MOST_ROWS = 1 << 15  # steps of agents that are looked at, at most; of more episodes every k-th step
 _FEWEST_INSIDE = 0.5  # least share of images that lie where transitions do to show something; these are judged
+_LITTLE, _LEANS = 0.05, 0.06
+"""Standard deviations that a number may be off what is expected without being above or below it, and by how much more
+often it is above in a transition than in its image where chance is skewed."""
 _PREFERS, _ELSEWHERE = 0.05, 0.5
 """Shifts of starts or first actions, in standard deviations: from the first on, what looks broken may be a preference;
 from the second on, of starts, images lie where no transition does."""
@@ -107,11 +110,12 @@ def _judge(element: Element, spaces: Spaces, halves: Sequence[_Half], first: Tra
         alone, planted, *others = (
             torch.cat(parts) for parts in zip(*(one.fields[name] for one in compared), strict=True)
         )
+        leans = torch.cat([one.leans[name] for one in compared])
         still = all(float(half.spread[half.fields[name]].sum()) < STILL**2 for half in halves)
         # that it never changes is its law where it is seen; that of what never came is unknown
         may = _flags(spaces).get(name, True) and may_come(name, ends, pays, forbids)
         of_nothing = concluded(name, 0.0, 0.0, broken=False, p_value=float(may))
-        verdicts.append(of_nothing if still else _judged(name, alone, planted[:, counts], others))
+        verdicts.append(of_nothing if still else _judged(name, alone, planted[:, counts], others, leans))
     found = ElementVerdict(element.name, declared, (*verdicts, *_unrecorded(spaces, halves[0].fields)))
     image = turned(first, transform)
     shift, preference = _shift(first.obs, image.obs), _shift(done(first, spaces), done(image, spaces))
@@ -136,23 +140,27 @@ def _unrecorded(spaces: Spaces, recorded: Collection[str]) -> list[FieldVerdict]
     return [FieldVerdict(name, "not covered", 0.0, 0.0) for name in missing]
 
 
-def _judged(name: str, alone: Tensor, planted: Tensor, others: Sequence[Tensor]) -> FieldVerdict:
+def _judged(name: str, alone: Tensor, planted: Tensor, others: Sequence[Tensor], leans: Tensor) -> FieldVerdict:
     """Judge one field by how much larger errors are on images, as shares of the variance.
 
     `alone` [M] are squared errors of what follows, `planted` [M, functions] those with a breaking of the tolerance's
-    size, and `others` [M] those of squares and products.
+    size, and `others` [M] those of squares and products. `leans` [M, numbers] are of chance, see `_Compared`.
     """
-    gap, error = _mean(alone)
-    p_value = 1.0
+    (gap, error), p_value = _mean(alone), 1.0
     if planted.shape[1] and not _is_beyond(gap, error, _DOUBTFUL):
         expected, errors = _mean(planted - alone.unsqueeze(1))[0], _mean(planted)[1]
         p_value = float(torch.special.ndtr((gap - expected) / errors).max())
     for other, its_error in map(_mean, others if name.startswith("obs.") else ()):
         if other / its_error > gap / error and _is_beyond(other, its_error):
             gap, error = other, its_error
-    size = float(gap.clamp_min(0).sqrt())
+    size, broken = float(gap.clamp_min(0).sqrt()), _is_beyond(gap, error)
     error_of_size = min(float(error) / max(2 * size, 1e-12), float(error) ** 0.5)
-    return concluded(name, size, error_of_size, _is_beyond(gap, error), p_value)
+    if name.startswith("obs.") and not broken:
+        lean, errors = (x.abs() for x in _mean(leans))
+        most = int((lean / errors).argmax())
+        if lean[most] > max(SIGNIFICANT * float(errors[most]), _LEANS):
+            size, error_of_size, broken = float(lean[most]), float(errors[most]), True
+    return concluded(name, size, error_of_size, broken, p_value)
 
 
 class _Half:
@@ -185,7 +193,8 @@ class _Half:
         carried = transform.per_agent(self._planted.movedim(-1, 0)).movedim(0, -1)
         there, (size, counts) = self._sides(image, carried), strength(carried, self._controls(image), weight)
         worse = weight * ((self._trust * there.said - there.true).square() - self._errors)
-        fields = {}
+        leans = (weight * (self._lean(there) - self._lean(self._here))).mean((1, 2)).double()
+        fields, skewed = {}, {}
         for name, where in self.fields.items():
             main = where.start + int(self._deviation[where].argmax())
             variance = self.spread[where].sum().clamp_min(STILL**2)
@@ -201,7 +210,13 @@ class _Half:
             )
             parts = alone, (after - before + others) / variance, *of_chance
             fields[name] = tuple(part.double() for part in parts)
-        return _Compared(float(inside.mean()), counts, fields)
+            skewed[name] = leans[:, where]
+        return _Compared(float(inside.mean()), counts, fields, skewed)
+
+    def _lean(self, side: Sides) -> Tensor:
+        """Return 1 or -1 where numbers lie above or below what is expected by more than little, [M, T, N, O]."""
+        off = (side.true - self._trust * side.said)[..., : self._width]
+        return torch.where(off.abs() > _LITTLE * self.spread[: self._width].sqrt(), off.sign(), 0.0)
 
     def _sides(self, data: Transitions, functions: Tensor) -> Sides:
         said, others = self._predict(data)
@@ -229,6 +244,7 @@ class _Compared(NamedTuple):
     inside: float  # share of the images that lie where transitions do
     counts: Tensor  # which controls the element changes, [functions] bool
     fields: dict[str, tuple[Tensor, ...]]
+    leans: dict[str, Tensor]  # how much more often each number of a field lies above than below, [M, numbers]
 
 
 def _mean(samples: Tensor) -> tuple[Tensor, Tensor]:

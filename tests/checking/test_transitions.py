@@ -253,6 +253,17 @@ def test_gusts_along_one_diagonal_break_what_turns_it() -> None:
     assert {v.element: v.outcome for v in found} == {"rot90": "broken", "rot180": "holds", "flip-x": "broken"}
 
 
+@pytest.mark.parametrize(("skewed", "found"), [(True, "broken"), (False, "holds")])
+def test_chance_that_leans_to_one_side_breaks_what_turns_it_round(skewed: bool, found: str) -> None:
+    """Four exponential numbers less 4 have mean 0; so have two less two others, which lean to no side."""
+    spaces, data = gusts()
+    drawn = torch.empty(4, 4000, 1, 1).exponential_(generator=torch.Generator().manual_seed(1))
+    gust = drawn.sum(0) - 4 if skewed else drawn[:2].sum(0) - drawn[2:].sum(0)
+    moved = replace(data, next_obs=0.8 * data.obs + 0.2 * torch.stack([gust, torch.zeros_like(gust)], -1))
+    verdicts = check_transitions(spaces, moved, parse_elements("rot180,flip-x,flip-y", 1))
+    assert {v.element: v.outcome for v in verdicts} == {"rot180": found, "flip-y": found, "flip-x": "holds"}
+
+
 def test_numbers_of_any_type_are_taken() -> None:
     (_, of_flags), (spaces, of_numbers) = gusts(torch.bool), gusts()
     found = [check_transitions(spaces, data, parse_elements("rot180", 1)) for data in (of_flags, of_numbers)]
