@@ -8,7 +8,8 @@ from L_g s with K_g a give Y and Y'. The energy distance
 is 0 if and only if both have one distribution (eq. 5 and 6), for noise of any kind. A random prey or a noisy sensor is
 thus no false alarm, and no task has to turn its own noise along. It is small, though, where only means or spreads
 differ: twice the deviation gives 0.06 deviations. So means are compared by themselves, spreads by Gini's mean
-difference, E |X - X'| = 2 sigma / sqrt(pi) of normal chance, and skewness by how often three runs lean to one side.
+difference, E |X - X'| = 2 sigma / sqrt(pi) of normal chance, and skewness by how far the mean of three lies from
+their median.
 
 Two cases need no statistics. A field without chance is judged state by state: one that differs by more than rounding is
 a proof. And where a run from the images that meets the chance of X gives X itself, both have one distribution, too.
@@ -65,7 +66,7 @@ def state_by_state(
     """
     sides = [outcomes[name] for outcomes in (first, second, alike, near)]
     own, again, image, close = (side.isfinite().all(1) for side in sides)
-    if share := float(((again == own) & (close == own) & (image != own)).float().mean()):
+    if (share := float(((again == own) & (close == own) & (image != own)).float().mean())) > 0:
         return FieldVerdict(name, "broken", share, 0.0, share=share)  # numbers on one side alone
     known = own & again & image
     x, x2, y, close = (side[known] for side in sides)
@@ -198,13 +199,13 @@ def _within(distance: Distance, runs: Sequence[Tensor]) -> Tensor:
 
 
 def _lean(runs: Sequence[Tensor]) -> Tensor:
-    """Return of three runs how often their mean is above their median, less how often below [M, D].
+    """Return by how much the mean of three runs is above their median, on average [M, D].
 
-    That is 0 on average where chance is symmetric about its centre (the triples test; Randles et al., 1980, JASA 75).
+    It is expected to be 0 where chance is symmetric about its centre (as its sign in the triples test; Randles et al.,
+    1980, JASA 75).
     """
     threes = [torch.stack(three) for three in combinations(runs, 3)]
-    above = torch.stack([three.mean(0) - three.median(0).values for three in threes])
-    return torch.where(above.abs() > NEGLIGIBLE, above.sign(), 0.0).mean(0)
+    return torch.stack([three.mean(0) - three.median(0).values for three in threes]).mean(0)
 
 
 def _excess(distance: Distance, here: Sequence[Tensor], there: Sequence[Tensor]) -> Tensor:

@@ -19,6 +19,7 @@ from esp_envs.base import Environment
 from esp_envs.errors import UserError
 from esp_envs.spec import Discrete, Spaces
 
+FEWEST = 64  # episodes (or single transitions) below which nothing can be told
 EPISODES = 2048
 STEPS = 8  # steps of each episode that are looked at
 _MOST_BYTES = 2**31
@@ -121,6 +122,31 @@ def turned(data: Transitions, transform: Transform) -> Transitions:
     moves |= {"action_mask": transform.push_outputs}
     parts = {name: part.unsqueeze(0) for name, part in vars(data).items() if part is not None}
     return Transitions(**{name: moves.get(name, transform.per_agent)(part)[0] for name, part in parts.items()})
+
+
+def require_told(spaces: Spaces, data: Transitions) -> None:
+    """Raise a UserError for transitions that are too few, of other shapes than the spaces, or not finite."""
+    lead = (*data.obs.shape[:2], spaces.num_agents)
+    width = () if isinstance(spaces.action, Discrete) else (spaces.action.width,)
+    seen = (*lead, spaces.observation.width)
+    shapes = {"obs": seen, "action": (*lead, *width), "reward": lead, "next_obs": seen}
+    if data.action_mask is not None and isinstance(spaces.action, Discrete):
+        shapes["action_mask"] = (*lead, spaces.action.count)
+    shapes |= {name: lead for name in ("terminated", "alive") if getattr(data, name) is not None}
+    for name, shape in shapes.items():
+        found = tuple(getattr(data, name).shape)
+        if found != shape or len(lead) != 3 or 0 in found[1:]:
+            axes = "[episodes, steps, agents]" + (" and the width" if len(shape) > 3 else "")
+            raise UserError(f"'{name}' of the transitions has shape {list(found)}; give {axes}: {list(shape)}")
+    if len(data.obs) < FEWEST:
+        raise UserError(f"there are {len(data.obs)} episodes of transitions; record at least {FEWEST}")
+    for name in ("obs", "action", "reward", "next_obs"):
+        if not bool(getattr(data, name).isfinite().all()):
+            raise UserError(f"'{name}' of the transitions holds numbers that are not finite; leave those episodes out")
+    if isinstance(spaces.action, Discrete):
+        count, action = spaces.action.count, data.action
+        if action.is_floating_point() or not bool(((action >= 0) & (action < count)).all()):
+            raise UserError(f"'action' of the transitions holds other than the indices 0 to {count - 1}; give indices")
 
 
 def read_transitions(path: Path, spaces: Spaces) -> Transitions:

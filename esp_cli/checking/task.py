@@ -5,16 +5,15 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-from esp_cli.checking import comparison, paired, transitions
+from esp_cli.checking import comparison, paired, recorded, transitions
 from esp_cli.checking.candidates import candidates, named, refused, turns_freely
 from esp_cli.checking.recorded import Transitions, collect
 from esp_cli.checking.shifting import SHIFT, Shift
 from esp_cli.checking.verdicts import ElementVerdict, Watch
 from esp_cli.symmetry import Element
 from esp_cli.symmetry.admission import scene_of
-from esp_cli.symmetry.elements import AGENTS
 from esp_envs.base import Environment
 from esp_envs.errors import UserError
 from esp_envs.promises import MakeWorlds
@@ -27,7 +26,6 @@ TOLERATED = {PAIRED: comparison.TOLERATED, TRANSITIONS: transitions.TOLERATED}
 _COPIES = 256  # most worlds of a task that takes no state
 _EPISODES = 4096
 _UNTRIED = "shifts are tried where a task can be set to a state"
-_SEVERAL = "no state holds these items, and each agent's transitions do not show what others see beside them"
 
 
 @dataclass(frozen=True)
@@ -111,33 +109,25 @@ def judged(
     """Return the method that a task allows, and what it says of elements until time is over; a shift comes last."""
     probe = make(1, [0])
     seen, native = probe.spec, probe.has("set_state")
+    alone = (probe.inner.spec if isinstance(probe, RoleView) else seen).num_agents == 1
     if from_transitions or not probe.settable():
-        worlds = make(min(_COPIES, max(transitions.FEWEST, 8192 // seen.horizon)), [0])
+        worlds = make(min(_COPIES, max(recorded.FEWEST, 8192 // seen.horizon)), [0])
         data = collect(worlds, _EPISODES, until=(until + time.monotonic()) / 2, watch=watch)
         turns = [element for element in elements if isinstance(element, Element)]
         untried = [ElementVerdict(SHIFT, seen.shifts, (), _UNTRIED)] * (len(elements) - len(turns))
-        return TRANSITIONS, [*transitions.check_transitions(seen, data, turns, watch, until), *untried]
+        return TRANSITIONS, [*transitions.check_transitions(seen, data, turns, watch, until, alone), *untried]
 
     def settable(num_envs: int, seeds: Sequence[int]) -> Environment:
         env = make(num_envs, seeds)
         env.settable()
         return env
 
-    carried = [element for element in elements if _is_carried(element, probe.spec)]
+    carried = [e for e in elements if probe.spec.joint_fields is not None or not transitions.is_unheld(e, probe.spec)]
     by_pairs = paired.check_paired(settable, carried, not native, watch, until, spare)
     verdicts = dict(zip(carried, by_pairs, strict=True))
     if rest := [element for element in elements if element not in verdicts]:  # items that the simulator does not name
-        everybody = probe.inner.spec if isinstance(probe, RoleView) else probe.spec
-        for element, found in zip(rest, judged(make, rest, True, watch, min(until, spare))[1], strict=True):
-            # what others see may say what a colour or word means
-            unseen = everybody.num_agents > 1 and found.outcome == "holds"
-            verdicts[element] = replace(found, fields=(), reason=_SEVERAL) if unseen else found
+        verdicts |= zip(rest, judged(make, rest, True, watch, min(until, spare))[1], strict=True)
     return PAIRED, [verdicts[element] for element in elements]
-
-
-def _is_carried(element: Element | Shift, spaces: Spaces) -> bool:
-    named = {field.name for field in spaces.state.fields}
-    return spaces.joint_fields is not None or all(name in named or name == AGENTS for name, _ in element.orders)
 
 
 def _reported(

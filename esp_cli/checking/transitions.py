@@ -27,13 +27,13 @@ from torch import Tensor
 from esp_cli.checking.candidates import is_declared
 from esp_cli.checking.controls import STILL, Controls, Sides, strength, trust_in
 from esp_cli.checking.predictor import Predictor, done
-from esp_cli.checking.recorded import Transitions, outputs_of, turned
+from esp_cli.checking.recorded import Transitions, outputs_of, require_told, turned
+from esp_cli.checking.shifting import Shift
 from esp_cli.checking.verdicts import SIGNIFICANT, ElementVerdict, FieldVerdict, Watch, concluded, may_come, verdicts_of
 from esp_cli.symmetry import Element, Transform, build_transform
-from esp_envs.errors import UserError
-from esp_envs.spec import Discrete, Spaces, TaskSpec
+from esp_cli.symmetry.elements import AGENTS
+from esp_envs.spec import Spaces, TaskSpec
 
-FEWEST = 64  # episodes (or single transitions) below which nothing can be told
 TOLERATED = 0.2  # standard deviations of a field that a step from the image may differ from the step's image
 _SEEN = 0.1  # squared share of the tolerance from which a gap beyond chance is a breaking: predictors err
 _DOUBTFUL = 4.0  # standard errors from which such a gap is no breaking yet, but leaves an element uncovered
@@ -42,6 +42,8 @@ _HIDES, _CARRIES = 0.25, 0.9
 hides what is usual, from the second on what is left is too little to say that rewards hold."""
 _MOST_ROWS = 1 << 15  # steps of agents that are looked at, at most; of more episodes every k-th step
 _FEWEST_INSIDE = 0.5  # least share of images that lie where transitions do to show something; these are judged
+_TURNED = 1e-5  # by which the image of what never changes differs from it by more than rounding
+_BESIDE_OTHERS = "no state holds these items, and each agent's transitions do not show what others see beside them"
 _LITTLE, _LEANS = 0.05, 0.06
 """Standard deviations that a number may be off what is expected without being above or below it, and by how much more
 often it is above in a transition than in its image where chance is skewed."""
@@ -56,14 +58,16 @@ def check_transitions(
     elements: Sequence[Element],
     watch: Watch = lambda *_: None,
     until: float = math.inf,
+    by_itself: bool | None = None,
 ) -> list[ElementVerdict]:
     """Judge elements from 64 episodes or more of anybody's transitions, of a policy that prefers no direction.
 
     Each episode counts once. `watch` is told of how many elements of how many are judged; `until` as in `verdicts_of`.
+    `by_itself` says whether nobody else acts, by default whether there is one agent.
     """
     data = data.map(_plain)
     data = replace(data, reward=data.reward.float())
-    _refuse_what_says_nothing(spaces, data)
+    require_told(spaces, data)
     usual = _without_tails(data.reward)
     is_little = usual is not data.reward and bool(usual.var() < (1 - _CARRIES) * data.reward.var())
     data = replace(data, reward=usual)
@@ -77,7 +81,7 @@ def check_transitions(
         return [_Half(spaces, controls, fitted, held) for fitted, held in (parts, parts[::-1])]
 
     def judge(element: Element) -> ElementVerdict:
-        found = _judge(element, spaces, halves(), first)
+        found = _judge(element, spaces, halves(), first, spaces.num_agents == 1 if by_itself is None else by_itself)
         told = (_untold(field) if is_little and field.field == "reward" else field for field in found.fields)
         return replace(found, fields=tuple(told))
 
@@ -94,8 +98,18 @@ def _untold(field: FieldVerdict) -> FieldVerdict:
     return replace(field, outcome="not covered", p_value=1.0) if field.outcome == "holds" else field
 
 
-def _judge(element: Element, spaces: Spaces, halves: Sequence[_Half], first: Transitions) -> ElementVerdict:
+def is_unheld(element: Element | Shift, spaces: Spaces) -> bool:
+    """Return whether an element orders items that no state holds but what agents see."""
+    held = {AGENTS} if spaces.joint_fields is not None else {AGENTS, *(field.name for field in spaces.state.fields)}
+    return any(name not in held for name, _ in element.orders)
+
+
+def _judge(
+    element: Element, spaces: Spaces, halves: Sequence[_Half], first: Transitions, by_itself: bool
+) -> ElementVerdict:
     declared, transform = is_declared(element, spaces), build_transform([element], spaces)
+    image = turned(first, transform)
+    moved = (_outputs(image) - _outputs(first)).mean(0)
     compared = [half.compared(transform) for half in halves]
     if (share := min(one.inside for one in compared)) < _FEWEST_INSIDE:
         reason = f"{1 - share:.0%} of the images lie outside what was seen"
@@ -114,13 +128,17 @@ def _judge(element: Element, spaces: Spaces, halves: Sequence[_Half], first: Tra
         still = all(float(half.spread[half.fields[name]].sum()) < STILL**2 for half in halves)
         # that it never changes is its law where it is seen; that of what never came is unknown
         may = _flags(spaces).get(name, True) and may_come(name, ends, pays, forbids)
-        of_nothing = concluded(name, 0.0, 0.0, broken=False, p_value=float(may))
+        turns = bool((moved[..., halves[0].fields[name]].abs() > _TURNED).any())
+        of_nothing = concluded(name, float(turns), 0.0, broken=turns, p_value=float(may))
         verdicts.append(of_nothing if still else _judged(name, alone, planted[:, counts], others, leans))
     found = ElementVerdict(element.name, declared, (*verdicts, *_unrecorded(spaces, halves[0].fields)))
-    image = turned(first, transform)
-    shift, preference = _shift(first.obs, image.obs), _shift(done(first, spaces), done(image, spaces))
+    if found.outcome == "holds" and not by_itself and is_unheld(element, spaces):
+        return replace(found, fields=(), reason=_BESIDE_OTHERS)
+    powers = (1, 2, 4) if found.outcome == "broken" else (1, 2)  # in a square turns by 45 degrees show in the fourth
+    shift = _shift(first.obs, image.obs, powers)
     if shift > (_PREFERS if found.outcome == "broken" else _ELSEWHERE):
         return ElementVerdict(element.name, declared, (), f"the starts differ from their image by {shift:.2f} s.d.")
+    preference = _shift(done(first, spaces), done(image, spaces), powers)
     if preference > _PREFERS and found.outcome == "broken":
         reason = f"the first actions differ from their image by {preference:.2f} s.d."
         return ElementVerdict(element.name, declared, (), reason)
@@ -168,7 +186,7 @@ class _Half:
 
     def __init__(self, spaces: Spaces, controls: Controls, fitted: Transitions, held: Transitions) -> None:
         parts = outputs_of(fitted)
-        outputs = torch.cat([*parts.values()], -1)
+        outputs = _outputs(fitted)
         self._width, self._controls, self.held = outputs.shape[-1], controls, held
         self._mean, self._deviation = outputs.mean((0, 1, 2)), outputs.flatten(0, 2).std(0)
         places = spaces.observation.slices().values()
@@ -229,7 +247,7 @@ class _Half:
 
         Squares and products are of standard deviations from the mean.
         """
-        outputs = torch.cat([*outputs_of(data).values()], -1)
+        outputs = _outputs(data)
         centred = (outputs - self._mean) / self._deviation.clamp_min(STILL)
         return torch.cat([outputs, centred.square(), centred[..., : len(self._next)] * centred[..., self._next]], -1)
 
@@ -257,30 +275,6 @@ def _is_beyond(gap: Tensor | float, error: Tensor | float, errors: float = SIGNI
     return bool(gap > errors * error) and bool(gap > _SEEN * TOLERATED**2)
 
 
-def _refuse_what_says_nothing(spaces: Spaces, data: Transitions) -> None:
-    lead = (*data.obs.shape[:2], spaces.num_agents)
-    width = () if isinstance(spaces.action, Discrete) else (spaces.action.width,)
-    seen = (*lead, spaces.observation.width)
-    shapes = {"obs": seen, "action": (*lead, *width), "reward": lead, "next_obs": seen}
-    if data.action_mask is not None and isinstance(spaces.action, Discrete):
-        shapes["action_mask"] = (*lead, spaces.action.count)
-    shapes |= {name: lead for name in ("terminated", "alive") if getattr(data, name) is not None}
-    for name, shape in shapes.items():
-        found = tuple(getattr(data, name).shape)
-        if found != shape or len(lead) != 3 or 0 in found[1:]:
-            axes = "[episodes, steps, agents]" + (" and the width" if len(shape) > 3 else "")
-            raise UserError(f"'{name}' of the transitions has shape {list(found)}; give {axes}: {list(shape)}")
-    if len(data.obs) < FEWEST:
-        raise UserError(f"there are {len(data.obs)} episodes of transitions; record at least {FEWEST}")
-    for name in ("obs", "action", "reward", "next_obs"):
-        if not bool(getattr(data, name).isfinite().all()):
-            raise UserError(f"'{name}' of the transitions holds numbers that are not finite; leave those episodes out")
-    if isinstance(spaces.action, Discrete):
-        count, action = spaces.action.count, data.action
-        if action.is_floating_point() or not bool(((action >= 0) & (action < count)).all()):
-            raise UserError(f"'action' of the transitions holds other than the indices 0 to {count - 1}; give indices")
-
-
 def _without_tails(reward: Tensor) -> Tensor:
     """Return rewards with the rarest hundredth clamped where it hides what is usual: no regression follows it."""
     low, high = torch.quantile(reward.flatten()[: 1 << 24], torch.tensor([0.005, 0.995])).tolist()
@@ -288,12 +282,17 @@ def _without_tails(reward: Tensor) -> Tensor:
     return clamped if low < high and clamped.var() < (1 - _HIDES) * reward.var() else reward
 
 
-def _shift(start: Tensor, turned: Tensor) -> float:
-    """Return the largest shift of mean or spread of starts [M, 1, N, D] in s.d. that is no chance, else 0."""
+def _outputs(data: Transitions) -> Tensor:
+    """Return all that follows for each agent, [M, T, N, numbers]."""
+    return torch.cat([*outputs_of(data).values()], -1)
+
+
+def _shift(start: Tensor, turned: Tensor, powers: Sequence[int]) -> float:
+    """Return the largest shift of moments of starts [M, 1, N, D] in standard deviations that is no chance, else 0."""
     start, turned = start.flatten(1).double(), turned.flatten(1).double()
     spread = torch.cat([start, turned]).std(0).clamp_min(1e-3)
     worst = 0.0
-    for power in (1, 2):
+    for power in powers:
         gap = (start / spread) ** power - (turned / spread) ** power
         size, error = gap.mean(0).abs(), gap.std(0) / len(gap) ** 0.5
         worst = max(worst, float(torch.where(size > SIGNIFICANT * error, size, 0.0).max()))

@@ -47,8 +47,8 @@ def discover(
 ) -> None:
     """Find symmetries that nobody declared, and print the --transforms that use them.
 
-    An element is accepted only if the data would have shown a breaking of the tolerance's size. Of elements that are
-    off by as much or more, one in a hundred is accepted. Where the data could not show it, an element is "not covered".
+    An element is accepted only if the data would have shown a breaking of the tolerance's size. Where they could not,
+    it is "not covered".
     """
     found = _discovery(what, task, transforms, parse_task_settings(settings or []), logs, seconds)
     tried = [

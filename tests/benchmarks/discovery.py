@@ -96,16 +96,19 @@ def of_random_task(seed: int) -> dict[str, Any]:
 
 def counted(tasks: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Count what was said falsely of random tasks."""
-    broken, symmetric = list[tuple[int, str, bool]](), list[tuple[int, str, bool]]()
+    broken, symmetric = list[tuple[int, str, str]](), list[tuple[int, str, str]]()
     for task in tasks:
         for name, found in task["elements"].items():
-            entry = (task["seed"], name, found["outcome"] == "holds")
-            if found["off"] == "never seen" or found["off"] >= TOLERATED:
+            entry = (task["seed"], name, found["outcome"])
+            if found["off"] == "never seen":
+                continue  # its images lie where no transition does, so that nothing could say that it holds
+            if found["off"] >= TOLERATED:
                 broken.append(entry)
             elif found["off"] < SYMMETRIC:
                 symmetric.append(entry)
-    false = [entry[:2] for entry in broken if entry[2]]
-    missed = [entry[:2] for entry in symmetric if not entry[2]]
+    false = [entry[:2] for entry in broken if entry[2] == "holds"]
+    missed = [entry[:2] for entry in symmetric if entry[2] != "holds"]
+    accused = [entry[:2] for entry in symmetric if entry[2] == "broken"]
     rewards = {task["seed"]: task["reward"] for task in tasks}
     accepted = len(false) + len(symmetric) - len(missed)
     return {
@@ -123,6 +126,7 @@ def counted(tasks: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "misses": len(missed),
         "share of symmetric ones that are missed": len(missed) / max(1, len(symmetric)),
         "falsely accepted": false,
+        "called broken though symmetric": accused,
         "misses by reward": dict(Counter(rewards[seed] for seed, _ in missed).most_common()),
         "seconds": sum(task["seconds"] for task in tasks),
     }

@@ -243,12 +243,15 @@ def test_chance_of_another_spread_is_broken_by_the_difference_of_deviations():
     assert by_distances("wind", sides(*normal[:4], *(1.3 * one for one in normal[4:]))).outcome == "broken"
 
 
-def test_skewed_chance_is_broken_by_how_often_three_runs_lean_to_a_side():
-    """Of numbers that are -1 with 3/4 and 3 with 1/4, three lean up if one is 3 (27/64) and down if two are (9/64)."""
+def test_skewed_chance_is_broken_by_means_of_three_beside_their_medians():
+    """Numbers are -1 with 3/4 and 3 with 1/4, their deviation sqrt(3).
+
+    The mean of three is 4/3 above the median where one is 3 (27/64), and below where two are (9/64).
+    """
     g = torch.Generator().manual_seed(0)
     rare = [3.0 - 4 * (torch.rand(4096, 1, generator=g) < 0.75) for _ in range(8)]
     found = by_distances("wind", sides(*rare[:4], *(-one for one in rare[4:])))
-    assert (found.outcome, found.gap) == ("broken", pytest.approx(2 * 18 / 64, abs=0.03))
+    assert (found.outcome, found.gap) == ("broken", pytest.approx(2 * 18 / 64 * 4 / 3 / 3**0.5, abs=0.03))
     assert by_distances("wind", sides(*rare)).outcome == "holds"
 
 

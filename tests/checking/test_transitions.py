@@ -13,6 +13,7 @@ from esp_cli.symmetry import parse_elements
 from esp_envs import make
 from esp_envs.mpe.task import FORCE
 from esp_envs.spec import Continuous, Discrete, Field, Items, Kind, Spaces, discrete_moves, layout
+from tests.benchmarks.synthetic import Recipe
 from tests.checking.faults import Fault, as_scalars, declared, first_counts_more, wind, with_fault
 
 CONTINUOUS = {"actions": "continuous"}
@@ -88,11 +89,13 @@ def test_a_gap_is_in_standard_deviations_of_the_field() -> None:
 
 
 def paid(reward: Callable[[torch.Tensor], torch.Tensor], turn: float = 0.0) -> dict[str, str]:
-    """Return what is said of elements where a point in a square moves by its force, turned, and is paid there."""
+    """Return what is said of elements where a point in a disc moves by its force, turned, and is paid there."""
     g = torch.Generator().manual_seed(0)
     row = layout(Field("position", Kind.VECTOR))
     spaces = Spaces(num_agents=1, observation=row, state=row, action=FORCE, symmetry="c1")
-    position, action = 2 * torch.rand(2, 2048, 4, 1, 2, generator=g) - 1
+    angle, area = torch.rand(2, 2, 2048, 4, 1, generator=g)
+    disc = area.sqrt().unsqueeze(-1) * torch.stack([(2 * math.pi * angle).cos(), (2 * math.pi * angle).sin()], -1)
+    position, action = disc
     cos, sin = math.cos(turn), math.sin(turn)
     after = position + 0.1 * action @ torch.tensor([[cos, sin], [-sin, cos]])
     data = Transitions(position, action, reward(after), after)
@@ -111,6 +114,26 @@ def test_a_square_is_no_circle() -> None:
     found = paid(lambda x: -x.abs().amax(-1), turn=0.5)
     assert (found["rot90"], found["rot180"]) == ("holds", "holds")
     assert (found["rot45"], found["flip-x"]) == ("broken", "broken")
+
+
+def test_starts_in_a_square_accuse_no_mirror_between_its_axes() -> None:
+    """Means and spreads of a square are those of a disc, and its corners are not."""
+    env = Recipe.drawn(2083).make(2048, [0])
+    (verdict,) = check_transitions(env.spec, collect(env, 2048), parse_elements("flip22.5", env.spec.num_agents))
+    assert (verdict.outcome, verdict.fields) == ("not covered", ())
+    assert "differ from their image" in verdict.reason
+
+
+@pytest.mark.parametrize(("drift", "found"), [(0.1, "broken"), (0.0, "holds")])
+def test_what_always_moves_alike_is_turned_too(drift: float, found: str) -> None:
+    spaces, data = gusts()
+    row = layout(Field("velocity", Kind.VECTOR), Field("buoy", Kind.VECTOR))
+    spaces = replace(spaces, observation=row, state=row)
+    place = torch.randn(data.obs.shape, generator=torch.Generator().manual_seed(1))
+    after = 0.8 * data.obs, place + torch.tensor([drift, 0.0])
+    data = replace(data, obs=torch.cat([data.obs, place], -1), next_obs=torch.cat(after, -1))
+    verdicts = check_transitions(spaces, data, parse_elements("rot180,flip-x", 1))
+    assert {v.element: v.outcome for v in verdicts} == {"rot180": found, "flip-x": "holds"}
 
 
 def test_a_reward_that_never_comes_is_not_covered_and_one_that_is_noise_is() -> None:
