@@ -39,7 +39,7 @@ BREAKING = {
 }
 """Figures in docs/measured, one for each setting -> how the names of the results go on that are drawn together."""
 TUNED = {
-    "tuned-navigation": ("tuned-navigation-mappo", "tuned-navigation-maddpg", "tuned-navigation-qmix"),
+    "tuned-navigation": ("tuned-navigation-mappo", "tuned-wide-navigation-maddpg", "tuned-wide-navigation-qmix"),
     "tuned-predator-prey": ("tuned-mappo", "tuned-maddpg", "tuned-qmix"),
 }
 """Figures in docs/measured -> the results that are drawn together, those of the figure's task."""
