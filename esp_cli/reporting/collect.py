@@ -32,7 +32,6 @@ from esp_envs.errors import UserError
 from esp_envs.spec import TaskSpec
 
 _LIKE = 0.1  # of the steps trained, by which evaluations that are compared may lie apart
-_DIGITS = 4  # decimals that are kept of a return; the bootstrap and the tables need two
 
 
 @dataclass(frozen=True)
@@ -247,7 +246,7 @@ def _results(study: Study, states: Mapping[str, _State], mode: Mode, thresholds:
 def _cell(study: Study, cell: Cell, state: _State, mode: Mode, config: Mapping[str, Any]) -> CellResult:
     curve, kind, final = state.curve, kind_of(study.kind), state.final
     compared = curve.until(state.at) if curve is not None and state.at is not None else curve
-    anchors = {name: round(value, _DIGITS) for name, value in (final.anchors if final else state.floor).items()}
+    anchors = {name: _short(value) for name, value in (final.anchors if final else state.floor).items()}
     fields: dict[str, Any] = {}
     if final is not None:
         fields = {
@@ -291,10 +290,13 @@ def _passings(curve: RunCurve | None, thresholds: Sequence[float]) -> tuple[Pass
     """Return the first steps of a curve at thresholds."""
     if curve is None:
         return ()
-    rounded = np.round(curve.values, _DIGITS)  # as the returns are, from which thresholds are taken
-    passings = [steps_to_threshold(curve.steps, rounded, limit) for limit in thresholds]
-    return tuple(replace(passing, threshold=round(passing.threshold, _DIGITS)) for passing in passings)
+    rounded = np.vectorize(_short, otypes=[float])(curve.values)  # as the returns are, from which thresholds are taken
+    return tuple(replace(steps_to_threshold(curve.steps, rounded, x), threshold=_short(x)) for x in thresholds)
 
 
 def _rounded(values: Iterable[float | None]) -> tuple[float | None, ...]:
-    return tuple(None if x is None or not math.isfinite(x) else round(float(x), _DIGITS) for x in values)
+    return tuple(None if x is None or not math.isfinite(x) else _short(x) for x in values)
+
+
+def _short(value: float) -> float:
+    return float(f"{value:.9g}")  # of any scale; float32, in which returns are summed, has no more digits
