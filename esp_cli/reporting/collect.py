@@ -21,10 +21,10 @@ from esp_cli.reporting.results import CellResult, Results, returns_of, summarise
 from esp_cli.studies.kinds import kind_of
 from esp_cli.studies.paper import reported
 from esp_cli.studies.plan import Cell, Study
-from esp_cli.studies.study import StudyFolder, read_evaluation
+from esp_cli.studies.study import StudyFolder
 from esp_cli.training.build import spec_of
 from esp_cli.training.config import RunConfig
-from esp_cli.training.folder_names import METRICS
+from esp_cli.training.folder_names import CONFIG, METRICS
 from esp_cli.training.metrics import column, elapsed_s, read_last_row, read_metrics
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.settings import parse_config
@@ -219,14 +219,12 @@ def _refuse_unlike(curves: Sequence[RunCurve]) -> None:
 
 
 def _state(folder: StudyFolder, cell: Cell, mode: Mode) -> _State:
-    run, final = folder.run_path(cell), None
-    if folder.is_trained(cell) and (final := read_evaluation(run)) is not None:
-        wanted = len(cell.config.seeds)
-        if any(len(returns.per_seed) != wanted for returns in (final.greedy, final.stochastic)):
-            raise UserError(f"{run} does not fit its study: its final evaluation has not the {wanted} seeds of the run")
+    run = folder.run_path(cell)
+    if (run / CONFIG).is_file() and not folder.is_own(cell):
+        raise UserError(f"{run} does not fit its study: its {CONFIG} is that of another run, or damaged")
     curve = begun_curve(run, cell, mode)
     step = curve.trained if curve else read_last_row(run / METRICS).get("step", 0)
-    return _State(step, curve, final, folder.has_stopped(cell))
+    return _State(step, curve, folder.evaluation(cell) if folder.is_trained(cell) else None, folder.has_stopped(cell))
 
 
 def _results(study: Study, states: Mapping[str, _State], mode: Mode, thresholds: Sequence[float]) -> Results:
