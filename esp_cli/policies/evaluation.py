@@ -24,7 +24,7 @@ from esp_cli.training.build import (
     generators,
     play,
 )
-from esp_cli.training.config import RunConfig
+from esp_cli.training.config import RunConfig, is_same
 from esp_envs.base import BLIND
 from esp_envs.errors import UserError
 from esp_envs.registry import TASKS
@@ -66,6 +66,15 @@ class FinalEvaluation(BaseModel):
     def scale(self) -> dict[str, float]:
         """The anchors by which returns are normalised; none where a return is a mean over unlike roles."""
         return {} if self.roles else self.anchors
+
+    def is_of(self, config: RunConfig, episodes: int) -> bool:
+        """Return whether this is what a run of a configuration came to, on so many episodes per seed."""
+        numbers = [len(returns.per_seed) for returns in (self.greedy, self.stochastic)]
+        told = (self.task, self.seeds, self.episodes, numbers)
+        if told != (config.task, config.seeds, episodes, [len(config.seeds)] * 2) or self.step < config.steps:
+            return False
+        played = {"task_settings": self.task_settings} if self.task_settings else {}  # older versions did not tell them
+        return is_same(config, config.model_dump(mode="json") | played)
 
 
 def evaluate(trained: TrainedPolicy, episodes: int) -> FinalEvaluation:

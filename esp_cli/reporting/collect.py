@@ -21,10 +21,10 @@ from esp_cli.reporting.results import CellResult, Results, returns_of, summarise
 from esp_cli.studies.kinds import kind_of
 from esp_cli.studies.paper import reported
 from esp_cli.studies.plan import Cell, Study
-from esp_cli.studies.study import StudyFolder, read_evaluation
+from esp_cli.studies.study import StudyFolder
 from esp_cli.training.build import spec_of
 from esp_cli.training.config import RunConfig
-from esp_cli.training.folder_names import METRICS
+from esp_cli.training.folder_names import CONFIG, METRICS
 from esp_cli.training.metrics import column, elapsed_s, read_last_row, read_metrics
 from esp_cli.training.run_folder import RunFolder
 from esp_cli.training.settings import parse_config
@@ -32,7 +32,6 @@ from esp_envs.errors import UserError
 from esp_envs.spec import TaskSpec
 
 _LIKE = 0.1  # of the steps trained, by which evaluations that are compared may lie apart
-_DIGITS = 4  # decimals that are kept of a return; the bootstrap and the tables need two
 
 
 @dataclass(frozen=True)
@@ -220,14 +219,12 @@ def _refuse_unlike(curves: Sequence[RunCurve]) -> None:
 
 
 def _state(folder: StudyFolder, cell: Cell, mode: Mode) -> _State:
-    run, final = folder.run_path(cell), None
-    if folder.is_trained(cell) and (final := read_evaluation(run)) is not None:
-        wanted = len(cell.config.seeds)
-        if any(len(returns.per_seed) != wanted for returns in (final.greedy, final.stochastic)):
-            raise UserError(f"{run} does not fit its study: its final evaluation has not the {wanted} seeds of the run")
+    run = folder.run_path(cell)
+    if (run / CONFIG).is_file() and not folder.is_own(cell):
+        raise UserError(f"{run} does not fit its study: its {CONFIG} is that of another run, or damaged")
     curve = begun_curve(run, cell, mode)
     step = curve.trained if curve else read_last_row(run / METRICS).get("step", 0)
-    return _State(step, curve, final, folder.has_stopped(cell))
+    return _State(step, curve, folder.evaluation(cell) if folder.is_trained(cell) else None, folder.has_stopped(cell))
 
 
 def _results(study: Study, states: Mapping[str, _State], mode: Mode, thresholds: Sequence[float]) -> Results:
@@ -247,7 +244,7 @@ def _results(study: Study, states: Mapping[str, _State], mode: Mode, thresholds:
 def _cell(study: Study, cell: Cell, state: _State, mode: Mode, config: Mapping[str, Any]) -> CellResult:
     curve, kind, final = state.curve, kind_of(study.kind), state.final
     compared = curve.until(state.at) if curve is not None and state.at is not None else curve
-    anchors = {name: round(value, _DIGITS) for name, value in (final.anchors if final else state.floor).items()}
+    anchors = {name: _short(value) for name, value in (final.anchors if final else state.floor).items()}
     fields: dict[str, Any] = {}
     if final is not None:
         fields = {
@@ -291,10 +288,13 @@ def _passings(curve: RunCurve | None, thresholds: Sequence[float]) -> tuple[Pass
     """Return the first steps of a curve at thresholds."""
     if curve is None:
         return ()
-    rounded = np.round(curve.values, _DIGITS)  # as the returns are, from which thresholds are taken
-    passings = [steps_to_threshold(curve.steps, rounded, limit) for limit in thresholds]
-    return tuple(replace(passing, threshold=round(passing.threshold, _DIGITS)) for passing in passings)
+    rounded = np.vectorize(_short, otypes=[float])(curve.values)  # as the returns are, from which thresholds are taken
+    return tuple(replace(steps_to_threshold(curve.steps, rounded, x), threshold=_short(x)) for x in thresholds)
 
 
 def _rounded(values: Iterable[float | None]) -> tuple[float | None, ...]:
-    return tuple(None if x is None or not math.isfinite(x) else round(float(x), _DIGITS) for x in values)
+    return tuple(None if x is None or not math.isfinite(x) else _short(x) for x in values)
+
+
+def _short(value: float) -> float:
+    return float(f"{value:.9g}")  # of any scale; float32, in which returns are summed, has no more digits

@@ -49,7 +49,7 @@ class Trials(StudyFolder):
 
     def is_finished(self, cell: Cell) -> bool:
         """Return whether a trial has ended."""
-        return self.is_trained(cell) or self.has_stopped(cell)
+        return (self.is_trained(cell) or self.has_stopped(cell)) and self.is_own(cell)
 
     @classmethod
     def planned(cls, path: Path, study: Study, keep: bool = True) -> tuple[Self, bool]:

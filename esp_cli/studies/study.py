@@ -26,7 +26,7 @@ from esp_cli.files.opening import holding, is_held, open_own, read_regular
 from esp_cli.files.writing import TEMPORARY_PREFIX
 from esp_cli.policies.evaluation import FinalEvaluation
 from esp_cli.studies.plan import STUDY_FORMAT, Cell, Study
-from esp_cli.training.config import RunConfig, completed
+from esp_cli.training.config import RunConfig, is_same, known_settings
 from esp_cli.training.folder_names import CONFIG, FINAL, FRESH, LOCK, LOG, METRICS, POLICY, RUNS, STUDY, STUDY_LOCK
 from esp_cli.training.metrics import RETURN, elapsed_s, read_last_row
 from esp_cli.training.run_folder import RunFolder
@@ -35,13 +35,6 @@ from esp_envs.errors import UserError
 from esp_envs.registry import make
 
 FOLDER_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,199}")  # so that nothing is written outside of the study
-
-
-def _completed(cell: Cell) -> Cell:
-    """Return a stored cell with the settings that came later; one whose task is not at hand stays as it is."""
-    with contextlib.suppress(UserError):
-        return cell.model_copy(update={"config": completed(cell.config)})
-    return cell
 
 
 class StudyFolder:
@@ -157,7 +150,8 @@ class StudyFolder:
         study = STUDY_FORMAT.parse(path / STUDY, Study)
         if not study.cells:
             raise UserError(f"{path / STUDY} is damaged: it names no run; plan the study again under another --out")
-        return cls(path, study.model_copy(update={"cells": tuple(map(_completed, study.cells))}))
+        cells = tuple(cell.model_copy(update={"config": known_settings(cell.config)}) for cell in study.cells)
+        return cls(path, study.model_copy(update={"cells": cells}))
 
     @staticmethod
     def _refuse_unlike(path: Path, new: Cell, old: Cell) -> None:
@@ -174,12 +168,17 @@ class StudyFolder:
 
     def _refuse_old_rules(self, cell: Cell) -> None:
         """Refuse a finished run of an earlier version of its task, which other runs are not to stand beside."""
-        final = read_evaluation(self.run_path(cell))
-        if final is not None and final.task_version != (version := _task_version(cell.config)):
+        version = self._version(cell) if self.is_finished(cell) else None
+        if version is not None and version != (present := _task_version(cell.config)):
             raise UserError(
-                f"{self.run_path(cell)} was evaluated on {final.task} version {final.task_version}, but this is "
-                f"version {version}; choose another --out"
+                f"{self.run_path(cell)} holds a run of {cell.config.task} version {version}, but this is version "
+                f"{present}; choose another --out"
             )
+
+    def _version(self, cell: Cell) -> int | None:
+        """Return the version of its task under which a cell ended; None where no good file states it."""
+        final = self.evaluation(cell)
+        return RunFolder.open(self.run_path(cell)).task_version() if final is None else final.task_version
 
     def run_path(self, cell: Cell) -> Path:
         return self.path / RUNS / cell.name
@@ -212,11 +211,23 @@ class StudyFolder:
         last = read_last_row(self.run_path(cell) / METRICS).get(RETURN)
         return isinstance(last, list) and all(value is None for value in last)
 
+    def is_own(self, cell: Cell) -> bool:
+        """Return whether the run folder of a cell holds its run, and no other or a damaged one."""
+        with contextlib.suppress(UserError):
+            return is_same(cell.config, RunFolder.open(self.run_path(cell)).config)
+        return False
+
+    def evaluation(self, cell: Cell) -> FinalEvaluation | None:
+        """Read the final evaluation of a cell's policy; None where there is none, or one of anything else."""
+        final = read_evaluation(self.run_path(cell))
+        fits = final is not None and final.is_of(cell.config, self.study.episodes) and self.is_own(cell)
+        return final if fits else None
+
     def is_finished(self, cell: Cell) -> bool:
         """Return whether a cell has ended: its policy is evaluated, or every seed stopped."""
         if self.is_trained(cell):
-            return read_evaluation(self.run_path(cell)) is not None
-        return self.has_stopped(cell)
+            return self.evaluation(cell) is not None
+        return self.has_stopped(cell) and self.is_own(cell)
 
     def next_command(self, cell: Cell) -> list[str]:
         """Return the arguments that train a cell, or that evaluate it once it is trained."""
@@ -253,15 +264,13 @@ class StudyFolder:
         if self.run_path(cell).exists():
             return None
         alike = (
-            other.run_path(theirs)
+            (other.run_path(theirs), other._version(theirs))
             for other in others
             if other.study.episodes == self.study.episodes
             for theirs in other.study.cells
             if theirs.config == cell.config and other.is_finished(theirs)
         )
-        finals = ((path, read_evaluation(path)) for path in alike)
-        of_rules = (path for path, one in finals if one is None or one.task_version == _task_version(cell.config))
-        return next(of_rules, None)
+        return next((path for path, version in alike if version in (None, _task_version(cell.config))), None)
 
     def adopt(self, cell: Cell, twin: Path) -> None:
         """Take a finished run over as this cell's, without links, which bring in files from anywhere; its log tells."""

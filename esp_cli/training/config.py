@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import shlex
@@ -253,6 +254,20 @@ def completed(config: RunConfig) -> RunConfig:
     learner = validate(ALGORITHMS[config.algorithm].config_class, config.algorithm_settings, config.algorithm)
     changes = {"task_settings": task.model_dump(mode="json"), "algorithm_settings": learner.model_dump(mode="json")}
     return config.model_copy(update=changes)
+
+
+def known_settings(config: RunConfig) -> RunConfig:
+    """Return what `completed` does; the configuration as it is where its task is not at hand, or refuses it."""
+    with contextlib.suppress(UserError):
+        return completed(config)
+    return config
+
+
+def is_same(config: RunConfig, stored: object) -> bool:
+    """Return whether a configuration is the one that a file holds, but for settings that came since."""
+    with contextlib.suppress(UserError):
+        return known_settings(validate(RunConfig, stored, "config")) == config
+    return False
 
 
 def _read(value: object) -> object:

@@ -258,7 +258,16 @@ def test_a_run_reaches_what_it_ended_with_however_that_is_rounded():
     assert cell.steps_to[0].of_mean == 0
     rising = curve([[-200.0], [-187.80964]], "one", (0, 100), (0,))
     (cell,) = gathered([rising]).results.cells
-    assert (cell.steps_to[0].threshold, cell.steps_to[0].of_mean) == (-187.8096, 100)
+    assert (cell.steps_to[0].threshold, cell.steps_to[0].of_mean) == (-187.80964, 100)
+
+
+def test_a_verdict_does_not_depend_on_the_scale_of_the_rewards():
+    for scale in (1e-5, 1.0, 1e5):
+        rows = [scale * np.array([[0.0] * 3, [k + 0.1, k + 0.2, k * 1.3]]) for k in (1, 2)]
+        cells = gathered([curve(row, f"run {k}", (0, 100)) for k, row in enumerate(rows)]).results.cells
+        assert cells[1].summary.gap.ahead == "ahead"
+        assert cells[1].returns["greedy"] == pytest.approx(tuple(rows[1][-1]), rel=1e-8, abs=0)
+        assert cells[1].steps_to[0].threshold == pytest.approx(1.2 * scale, rel=1e-8)
 
 
 def test_no_verdict_between_runs_that_are_below_a_policy_that_sees_nothing():

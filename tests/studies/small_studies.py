@@ -2,13 +2,13 @@
 
 import json
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from esp_cli.studies.catalogue import Request, plan
 from esp_cli.studies.plan import Cell, Study
 from esp_cli.studies.study import StudyFolder
+from esp_cli.training.config import RunConfig
 from esp_cli.training.folder_names import FINAL
 from tests.training.runs import TINY
 
@@ -36,18 +36,18 @@ def write_run(folder: StudyFolder, cell: Cell, rows: list[list[float | None]], f
     ]
     run.metrics_path.write_text("".join(json.dumps(line) + "\n" for line in lines))
     run.policy_path.write_bytes(b"weights")
-    (folder.run_path(cell) / FINAL).write_text(json.dumps(final_evaluation(finals, cell.config.seeds)))
+    (folder.run_path(cell) / FINAL).write_text(json.dumps(final_evaluation(finals, cell.config)))
 
 
-def final_evaluation(finals: list[float | None], seeds: Sequence[int] = SEEDS) -> dict[str, Any]:
+def final_evaluation(finals: list[float | None], config: RunConfig | None = None) -> dict[str, Any]:
     returns = {"mean": None, "sem": None, "ci95": None, "per_seed": finals}
     return {
         "esp_version": "0.0.1",
-        "task": "navigation",
+        "task": config.task if config else "navigation",
         "task_version": 1,
         "convention": "by hand",
-        "step": 200,
-        "seeds": list(seeds),
+        "step": config.steps if config else 200,
+        "seeds": list(config.seeds if config else SEEDS),
         "episodes": 4,
         "greedy": returns,
         "stochastic": returns,
@@ -76,7 +76,8 @@ what, run = sys.argv[1], pathlib.Path(sys.argv[-1] if sys.argv[1] == "train" els
 with (run.parent.parent / "trace.txt").open("a") as trace:
     trace.write(f"{what} {run.name}\n")
 if what == "eval":
-    pathlib.Path(sys.argv[-1]).write_text(FINAL)
+    own = json.loads((run / "config.json").read_text())
+    pathlib.Path(sys.argv[-1]).write_text(json.dumps(json.loads(FINAL) | {"task": own["task"]}))
     raise SystemExit
 lock = (run / "run.lock").open("a+")
 flock(lock, LOCK_EX | LOCK_NB)

@@ -220,14 +220,48 @@ def test_a_run_whose_seeds_all_stopped_has_ended_and_is_reported(tmp_path):
     assert [row[3] for row in TABLES["steps"](material.results).rows] == ["100", "-"]
     other = StudyFolder.create(tmp_path / "t", small_study())
     assert other.find_twin(esp, [folder]) == folder.run_path(esp), "another study need not try it again"
+    folder.prepare(esp).write_checkpoint(200, {}, {"task_version": 2})
+    assert other.find_twin(esp, [folder]) is None, "which has other rules"
+    with pytest.raises(UserError, match=r"-esp holds a run of navigation version 2, but this is version 1"):
+        StudyFolder.create(folder.path, small_study())
 
 
 def test_a_run_of_another_configuration_is_not_gone_on_with(tmp_path):
     folder = write_study(tmp_path / "s", small_study(), ENDS)
-    file = folder.run_path(folder.study.cells[0]) / "config.json"
+    cell = folder.study.cells[0]
+    file = folder.run_path(cell) / "config.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | {"steps": 7}))
+    assert not folder.is_finished(cell)
     with pytest.raises(ValueError, match="holds a run of another configuration"):
-        folder.prepare(folder.study.cells[0])
+        folder.prepare(cell)
+    with pytest.raises(UserError, match=r"does not fit its study: its config\.json is that of another run, or damaged"):
+        collect_study(folder)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"episodes": 1},
+        {"seeds": [0, 1, 3]},
+        {"step": 100},
+        {"task": "formation"},
+        {"task_settings": {"wind": 0.5}},
+        {"greedy": {"mean": None, "sem": None, "ci95": None, "per_seed": [-1.0]}},
+    ],
+)
+def test_an_evaluation_of_something_else_is_made_anew(tmp_path, other):
+    folder = write_study(tmp_path / "s", small_study(), ENDS)
+    cell = folder.study.cells[0]
+    file = folder.run_path(cell) / FINAL
+    final = json.loads(file.read_text())
+    for settings in (cell.config.task_settings, {"wind": 0.0, "gust_std": 0.0}):  # gust_std was a setting once
+        file.write_text(json.dumps(final | {"task_settings": settings}))
+        assert folder.is_finished(cell), "an earlier version told fewer settings, or more"
+    file.write_text(json.dumps(final | other))
+    assert not folder.is_finished(cell)
+    assert StudyFolder.create(tmp_path / "t", small_study()).find_twin(cell, [folder]) is None
+    assert collect_study(folder).results.cells[0].status == "unfinished"
+    assert folder.next_command(cell)[0] == "eval"
 
 
 def test_a_finished_run_of_the_same_configuration_is_taken_over_from_another_study(tmp_path):
@@ -268,7 +302,7 @@ def test_a_run_of_another_version_of_the_task_is_no_twin_and_its_study_does_not_
     folder = StudyFolder.create(tmp_path / "s", small_study())
     assert other.is_finished(plain)
     assert folder.find_twin(folder.study.cells[0], [other]) is None
-    with pytest.raises(UserError, match="was evaluated on navigation version 2, but this is version 1"):
+    with pytest.raises(UserError, match="holds a run of navigation version 2, but this is version 1"):
         StudyFolder.create(other.path, small_study())
 
 
