@@ -28,7 +28,7 @@ from esp_cli.algorithms.objectives import (
     value_error,
     value_loss,
 )
-from esp_cli.algorithms.rollout import Batch, Collector, Rollout, values_along
+from esp_cli.algorithms.rollout import Batch, Collector, LoneBatch, Rollout, values_along
 from esp_cli.networks.contract import Generators, NetworkConfig, Reads
 from esp_cli.networks.policy import Critic, StochasticPolicy
 from esp_cli.prior import Answers, Copies, Loss, mean_per_seed
@@ -179,7 +179,7 @@ class Mappo(Learner):
         ended = rollout.ended.unsqueeze(-1)
         terminated = rollout.terminated.unsqueeze(-1) if config.bootstrap_truncated else ended
         valid = None
-        if rollout.alive is not None and rollout.gone is not None and self.num_values > 1:
+        if rollout.alive is not None and rollout.gone is not None and not self.spec.shared_reward:
             # what follows an agent's end is not its
             terminated, ended, valid = terminated | rollout.gone, ended | rollout.gone, rollout.alive
         advantage = gae(reward, value, next_value, terminated, ended, config.gamma, config.gae_lambda)
@@ -192,7 +192,8 @@ class Mappo(Learner):
         fields = (*done, per_agent, self.normaliser.normalise(target), raw_value)
         flags = {"action_mask": rollout.action_mask, "alive": rollout.alive}
         known = {name: self._as_sequences(flag) for name, flag in flags.items() if flag is not None}
-        batch = Batch(*(self._as_sequences(x) for x in fields), **known)
+        kind = LoneBatch if self.spec.num_agents == 1 and not self.spec.shared_reward else Batch
+        batch = kind(*(self._as_sequences(x) for x in fields), **known)
         return batch, {"train/explained_variance": explained_variance(value, target, valid)}
 
     def _as_sequences(self, x: Tensor) -> Tensor:

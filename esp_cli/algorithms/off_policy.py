@@ -134,7 +134,7 @@ class OffPolicyLearner(Learner):
 
     def _store(self, episodes: EpisodeBatch) -> None:
         valid = episodes.valid.unsqueeze(-1).expand(episodes.reward.shape)
-        if episodes.reward.shape[-1] > 1:
+        if not self.spec.shared_reward:
             valid = episodes.of_living(valid)
         self.reward_scale.update(episodes.reward.flatten(2), valid.flatten(2))
         self.replay.add(episodes)
@@ -169,7 +169,7 @@ class OffPolicyLearner(Learner):
         standardised = self.reward_scale.scaled if ends_early else self.reward_scale.normalise
         reward = standardised(reward) * self.spec.horizon**-0.5
         over = ended.unsqueeze(-1)
-        if batch.alive is not None and next_value.shape[-1] > 1:
+        if batch.alive is not None and batch.own(next_value.shape[-1]):
             over = over | ~batch.alive[:, :, 1:]  # what follows an agent's end is not its own
         if bonus is not None:
             reward = reward + torch.where(over, 0.0, config.gamma * bonus)

@@ -53,6 +53,12 @@ class WholeEpisodes(EpisodeBatch):
     mask = played = None
 
 
+class LoneEpisodes(EpisodeBatch):
+    """Episodes of one agent that has a reward of its own."""
+
+    lone = True
+
+
 class EpisodeReplay:
     """The last `capacity` episodes of each of S seeds, allocated at once on the training device."""
 
@@ -70,6 +76,8 @@ class EpisodeReplay:
         else:
             action = room(steps, agents, space.width)
         kind = EpisodeBatch if spec.terminates or spec.agents_end else WholeEpisodes
+        if spec.agents_end and agents == 1 and not spec.shared_reward:
+            kind = LoneEpisodes
         self._store = kind(
             obs=room(steps + 1, agents, spec.observation.width),
             state=room(steps + 1, spec.state.width),

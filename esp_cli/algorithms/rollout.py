@@ -51,6 +51,12 @@ class Batch(SeedBatch):
     value: Tensor
 
 
+class LoneBatch(Batch):
+    """Experience of one agent that has a reward of its own."""
+
+    lone = True
+
+
 class Collector(Worlds):
     """Acts in the worlds and remembers, between rollouts, where each stands."""
 

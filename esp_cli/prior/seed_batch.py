@@ -20,6 +20,8 @@ class SeedBatch:
 
     # names of fields [S, B, ..., N] that move with their agents; those with one number per world stay
     per_agent: ClassVar[tuple[str, ...]] = ()
+    # whether one agent with a reward of its own is all there is, so that even a single value is that agent's
+    lone: ClassVar[bool] = False
 
     obs: Tensor  # [S, B, ..., N, D]
     state: Tensor  # [S, B, ..., Ds]
@@ -47,13 +49,17 @@ class SeedBatch:
         """[S, B, T] which rows belong to an episode; None where all do."""
         return None
 
+    def own(self, count: int) -> bool:
+        """Return whether C = `count` values of each row are the agents' own, not one of the world."""
+        return count > 1 or self.lone
+
     def valued(self, count: int) -> Tensor | None:
         """Return which of C = `count` values of each row count.
 
         A value per agent counts up to the agent's end. That of a world counts in every row of the episode: the reward
         that its agents share goes on behind the end of the last, and what is bootstrapped has to be learned.
         """
-        return self.mask if count > 1 else self.played
+        return self.mask if self.own(count) else self.played
 
     def map(self: Rows, function: Callable[[Tensor], Tensor]) -> Rows:
         """Return the batch with every tensor put through a function."""

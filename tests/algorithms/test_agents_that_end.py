@@ -265,3 +265,28 @@ def test_the_task_is_checked_evaluated_and_its_return_is_the_agents_own(tmp_path
     esp("train", "--task", TASK, "--steps", 500, "--set", "mappo.num_envs=8", "--set", "evaluation.episodes=4",
         "--set", "prior.transforms=flip-x", "--set", "mappo.num_minibatches=1", "--out", run)  # fmt: skip
     assert "arrived" in esp("eval", run, "--episodes", 4).stdout
+
+
+@pytest.mark.parametrize("shared", [False, True])
+@pytest.mark.parametrize("algorithm", ["maddpg", "qmix"])
+def test_what_is_paid_behind_the_end_of_a_lone_agent_counts_where_the_reward_is_no_agents_own(algorithm, shared):
+    trained = learner(algorithm, task__num_agents=1, task__shared=shared)
+    episodes, _ = trained.collector.collect()
+    alive = episodes.alive[:, :, :-1]
+    trained._store(replace(episodes, reward=torch.where(alive, 0.0, 1.0)))
+    batch = trained.replay.select(torch.arange(2).expand(2, 2))
+    assert torch.equal(trained.reward_scale.mean > 0, torch.tensor([shared, shared]))
+    target = trained.td_targets(batch, torch.zeros_like(batch.reward), torch.ones_like(batch.reward))
+    last = alive & ~episodes.alive[:, :, 1:]
+    assert bool((target[last] > 0).any()) is shared, "what is bootstrapped behind the end"
+    assert torch.equal(batch.valued(1), batch.valid if shared else alive)
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_mappo_values_a_lone_agent_up_to_its_end_where_the_reward_is_its_own(shared):
+    trained, rollout = collected(task__num_agents=1, task__shared=shared)
+    batch, _ = trained.prepare(replace(rollout, reward=torch.where(rollout.alive, 0.0, 1000.0)))
+    target = trained.normaliser.denormalise(batch.target).view(rollout.alive.shape)
+    assert bool((target[rollout.alive] > 10).any()) is shared, "what is paid behind the end"
+    assert (batch.valued(1) is None) is shared
+    assert shared or batch.valued(1) is batch.alive
