@@ -104,7 +104,7 @@ def beside(per_seed: Tensor, x: Tensor) -> Tensor:
 def explained_variance(value: Tensor, target: Tensor, valid: Tensor | None = None) -> Tensor:
     """Return 1 - Var[target - value] / Var[target] per seed, [S, ...] -> [S], over the numbers that are valid."""
     residual, whole = _variance(target - value, valid), _variance(target, valid)
-    return 1 - residual / whole.clamp_min(1e-8)
+    return 1 - residual / whole.clamp_min(torch.finfo(whole.dtype).tiny)
 
 
 def _variance(x: Tensor, valid: Tensor | None) -> Tensor:

@@ -53,6 +53,8 @@ def test_explained_variance_of_perfect_constant_and_opposite_predictions():
     value = torch.tensor([[1.0, 2.0, 3.0], [2.0, 2.0, 2.0], [3.0, 2.0, 1.0]])
     # residuals of the last: -2, 0, 2 with variance 8/3 against 2/3
     torch.testing.assert_close(explained_variance(value, target), torch.tensor([1.0, 0.0, -3.0]))
+    tiny = explained_variance(1e-6 * value, 1e-6 * target)
+    torch.testing.assert_close(tiny, torch.tensor([1.0, 0.0, -3.0]))
 
 
 def test_one_step_targets_by_hand_on_two_transitions():
