@@ -179,6 +179,4 @@ class SymmetryPrior:
 def _probe(spaces: Spaces, device: torch.device | str) -> list[Transform]:
     """Return a quarter turn and a mirror, as far as the task carries them, for measuring symmetry errors."""
     elements = [name for name in ("rot90", "flip-x") if carries(name, spaces)]
-    if elements == ["flip-x"]:  # both, or the turn alone
-        return []
     return transform_set(",".join(elements), spaces, device).each() if elements else []

@@ -139,6 +139,9 @@ def test_errors_are_measured_with_a_prior_and_without():
     for kind in ("esp", "none"):
         assert prior(kind=kind).errors(rows(), answers)["value_symmetry_error"].min() > 0.1
         assert prior(kind=kind).errors(rows(), symmetric)["value_symmetry_error"].max() < 1e-6
+    for symmetry in ("flip-x", "d2", "c4"):
+        probing = SymmetryPrior(PriorConfig(kind="none"), replace(SPACES, symmetry=symmetry))
+        assert "value_symmetry_error" in probing.errors(rows(), answers), f"{symmetry} holds a mirror or a turn"
 
 
 def test_a_seed_draws_the_same_elements_alone_and_among_others():
