@@ -16,7 +16,7 @@ from esp_envs.spec import Continuous, Discrete, Items, Spaces, TaskSpec
 DISCOVERED = "discovered:"  # begins transforms that were found in data, and that the task need not declare
 _WITHOUT = "use --prior none, or let what holds be found: --prior auto, or --set prior.transforms=discovered"
 # declared symmetries that no task writes: every element, and every one that leaves agents and items in place
-_ANYTHING, _ANY_SCENE = "any", "any-scene"
+_ANYTHING, _ANY_SCENE = "<any>", "<any-scene>"
 _FEW_ORDERS = 23  # orders that are weighed beside d4, each of which takes about as long: those of four agents
 # the planar groups that `carried_groups` tries, smaller ones first
 PLANE_GROUPS = ("c2", "d2", "c4", "d4", "c8", "d8", "so2", "o2")
