@@ -24,7 +24,7 @@ from esp_envs.spec import Field, Kind
 
 _PIXEL_TOLERANCE = 1e-6
 _MIRRORS = {"flip-x": 0, "flip-diagonal": 45, "flip-y": 90, "flip-antidiagonal": 135}  # axis in degrees
-_DEGREES = r"(\d+(?:\.\d+)?|\d+/0*[1-9]\d*)"
+_DEGREES = r"(\d{1,99}(?:\.\d{1,99})?|\d{1,99}/0{0,99}[1-9]\d{0,99})"
 _MAX_FOLD = 360
 
 

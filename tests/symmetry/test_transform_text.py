@@ -58,6 +58,8 @@ def test_large_products_are_sampled() -> None:
         ("", "unknown transform ''"),
         ("rot90,", "unknown transform '' in 'rot90,'"),
         ("rot1/0", "unknown transform 'rot1/0'"),
+        ("rot" + "9" * 5000, "unknown transform 'rot999"),
+        ("flip1/" + "9" * 5000, "unknown transform 'flip1/999"),
         ("c0", "'c0' is out of range"),
         ("c999", "'c999' is out of range"),
         ("identity", "only the identity"),
