@@ -50,8 +50,8 @@ class MaddpgConfig(ExploringConfig):
     output_penalty: float = Field(1e-3, ge=0, description="weight of the mean square of the actor's outputs")
 
     def without_effect(self, network: NetworkConfig, spec: Callable[[], TaskSpec]) -> frozenset[str]:
-        own = spec()
-        idle = frozenset() if isinstance(own.action, Discrete) else frozenset({"actor_gradient"})
+        own, idle = spec(), super().without_effect(network, spec)
+        idle |= frozenset() if isinstance(own.action, Discrete) else frozenset({"actor_gradient"})
         shared = all(role.shared_reward for role, _ in own.parts)
         joint = shared and type(network).joint_critic is not NetworkConfig.joint_critic
         return idle | {"critic_activation"} if joint else idle

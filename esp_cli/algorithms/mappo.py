@@ -80,6 +80,8 @@ class MappoConfig(LearnerConfig):
         idle = set() if network.recurrent else {"truncation"}
         if network.with_activation("relu") == network.with_activation("tanh"):
             idle.add("critic_activation")
+        if self.entropy_coef == 0:
+            idle.add("anneal_entropy")
         return frozenset(idle)
 
 

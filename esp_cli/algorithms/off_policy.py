@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import ClassVar, Literal
 
 import torch
@@ -21,6 +22,7 @@ from esp_cli.networks.policy import HistoryPolicy
 from esp_cli.prior import Answers, mean_per_seed
 from esp_envs.base import Environment
 from esp_envs.errors import UserError
+from esp_envs.spec import TaskSpec
 
 
 class OffPolicyConfig(LearnerConfig):
@@ -53,6 +55,9 @@ class ExploringConfig(OffPolicyConfig):
     epsilon_start: float = Field(1.0, ge=0, le=1, description="exploration at the start")
     epsilon_finish: float = Field(0.05, ge=0, le=1, description="exploration at the end")
     epsilon_steps: int = Field(50_000, ge=1, description="environment steps from start to finish, linearly")
+
+    def without_effect(self, network: NetworkConfig, spec: Callable[[], TaskSpec]) -> frozenset[str]:
+        return frozenset({"epsilon_steps"}) if self.epsilon_start == self.epsilon_finish else frozenset()
 
 
 class OffPolicyLearner(Learner):

@@ -44,7 +44,7 @@ class QmixConfig(ExploringConfig):
 
     def without_effect(self, network: NetworkConfig, spec: Callable[[], TaskSpec]) -> frozenset[str]:
         own = type(network).mixer is not NetworkConfig.mixer  # which has no hypernetwork
-        return frozenset({"hyper_width"}) if own else frozenset()
+        return super().without_effect(network, spec) | (frozenset({"hyper_width"}) if own else frozenset())
 
 
 # orthogonal gain of the utility network's last layer: the first values are small beside standardised rewards
