@@ -207,7 +207,7 @@ class OffPolicyLearner(Learner):
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
         super().load_state_dict(tensors)
         replay = below(tensors, "replay")
-        if "counters" not in tensors or tensors["counters"].shape != (2,):
+        if "counters" not in tensors or (tensors["counters"].shape, tensors["counters"].dtype) != ((2,), torch.int64):
             raise UserError("the checkpoint does not fit this configuration (it has no counters)")
         self.episodes, self.updates = tensors["counters"].tolist()
         if replay:

@@ -115,7 +115,8 @@ class EpisodeReplay:
         return filled | {"cursor": torch.tensor(self.cursor)}
 
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
-        if tensors.keys() != {*self._store.tensors, "cursor"} or tensors["obs"].dim() < 2:
+        known = tensors.keys() == {*self._store.tensors, "cursor"} and tensors["obs"].dim() >= 2
+        if not known or (tensors["cursor"].shape, tensors["cursor"].dtype) != ((), torch.int64):
             raise UserError("the saved episodes do not fit into the replay of this configuration")
         size = tensors["obs"].shape[1]
         for name, tensor in self._store.tensors.items():

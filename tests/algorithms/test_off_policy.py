@@ -7,6 +7,7 @@ import torch
 
 from esp_cli.algorithms.normalisation import ValueNormaliser
 from esp_cli.training.config import resolve_config
+from esp_envs.errors import UserError
 from tests.algorithms.off_policy import after, equal, learner, networks, turn
 
 ALGORITHMS = ["maddpg", "qmix"]
@@ -65,6 +66,11 @@ def test_a_learner_restored_between_iterations_goes_on_bit_for_bit_with_its_repl
     other = learner(algorithm, **choice)
     other.load_state_dict({n: t for n, t in halted.state_dict().items() if not n.startswith("replay")})
     assert other.replay.size == 0, "a complete run's checkpoint has no replay"
+    for wrong in ({"replay.cursor": torch.tensor([1, 2])}, {"replay.cursor": torch.tensor(torch.nan)}):
+        with pytest.raises(UserError, match="do not fit into the replay"):
+            other.load_state_dict(halted.state_dict() | wrong)
+    with pytest.raises(UserError, match="it has no counters"):
+        other.load_state_dict(halted.state_dict() | {"counters": torch.tensor([torch.nan, 1.0])})
 
 
 @both
