@@ -375,6 +375,28 @@ class NoRestart(Plain):
         return seen
 
 
+class Rolling(Plain):
+    """It has a speed, which the state leaves out, from rest."""
+
+    def _start(self, generator):
+        return super()._start(generator) | {"speed": torch.zeros(self.num_envs, 2, 2)}
+
+    def _advance(self, world, action):
+        world["speed"] = world["speed"] + action[..., :2]
+        world["position"] = world["position"] + world["speed"]
+        return super()._advance(world, action)
+
+
+class RollingOut(Rolling):
+    """Its episodes end early, so that steps begin others, which chance draws."""
+
+    def _describe(self):
+        return replace(super()._describe(), terminates=True)
+
+    def _ended(self, world):
+        return world["position"].abs().amax((-1, -2)) > 1
+
+
 def plain(**methods: object) -> type[Environment]:
     return type("_".join(methods), (Plain,), methods)
 
@@ -429,7 +451,10 @@ BREAKERS = {
     "a_joint_action_of_the_wrong_shape_is_refused": [
         plain(step=lambda self, action: Plain.step(self, action.reshape(self.action_shape)))
     ],
-    "set_state_reproduces_what_follows": [plain(_put=lambda self, state: Plain._put(self, state * 2))],
+    "set_state_reproduces_what_follows": [
+        *(Rolling, RollingOut),
+        plain(_put=lambda self, state: Plain._put(self, state * 2)),
+    ],
     "set_state_starts_an_episode": [NoRestart],
     "a_scene_can_be_drawn": [
         plain(scene=lambda self, world=(0, 0): Scene((), (0, 1, 0, world[0] + 1))),
