@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from esp_envs.base import Environment, Step
+from esp_envs.batched import FURTHER, BatchedTask
 from esp_envs.errors import UserError
 from esp_envs.installed import last_line, raised_in
 from esp_envs.promises import (
@@ -169,6 +170,8 @@ def set_state_reproduces_what_follows(subject: Subject) -> None:
         step = env.step(action)
         copy, twin, expected = (_before_a_new_start(made) for made in (other.step(action), third.step(action), step))
         if not nearly(copy, twin, subject.rounding):
+            if isinstance(other, BatchedTask):
+                _require_no_memory(other, third, observation.state, subject.rounding)
             raise NotAsked("the task has chance of its own")
         require(
             nearly(copy, expected, subject.rounding),
@@ -185,6 +188,20 @@ def _give_another_past(twins: Sequence[Environment], state: Tensor) -> None:
     action = twins[0].random_action()
     for worlds in twins:
         worlds.step(action)
+
+
+def _require_no_memory(env: Environment, twin: Environment, state: Tensor, rounding: float) -> None:
+    """Raise `Broken` where worlds of one state and chance part by what they keep beside it, which a step changes."""
+    env.set_state(state), twin.set_state(state)
+    before = env.state_dict()
+    twin.load_state_dict(twin.state_dict() | {"generators": before["generators"]})
+    first, second = (worlds.step(worlds.random_action()) for worlds in (env, twin))
+    if nearly(_before_a_new_start(first), _before_a_new_start(second), rounding):
+        return
+    for name, value in env.state_dict().items():
+        same = not name.startswith(FURTHER) or equal(value[~first.ended], before[name][~first.ended])
+        kept = name.removeprefix(FURTHER)
+        require(same, f"the world also keeps '{kept}', which a step changes; put it into the state or into 'hidden'")
 
 
 def _before_a_new_start(step: Step) -> list[Tensor]:

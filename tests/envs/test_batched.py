@@ -387,6 +387,13 @@ class Rolling(Plain):
         return super()._advance(world, action)
 
 
+class RollingOn(Rolling):
+    """Its first speed is drawn."""
+
+    def _start(self, generator):
+        return super()._start(generator) | {"speed": self.draw(2, 2, generator=generator)}
+
+
 class RollingOut(Rolling):
     """Its episodes end early, so that steps begin others, which chance draws."""
 
@@ -452,7 +459,7 @@ BREAKERS = {
         plain(step=lambda self, action: Plain.step(self, action.reshape(self.action_shape)))
     ],
     "set_state_reproduces_what_follows": [
-        *(Rolling, RollingOut),
+        *(Rolling, RollingOn, RollingOut),
         plain(_put=lambda self, state: Plain._put(self, state * 2)),
     ],
     "set_state_starts_an_episode": [NoRestart],
@@ -472,6 +479,19 @@ def test_a_task_that_breaks_a_promise_is_found(name: str, cls: type[Environment]
         BY_NAME[name](Subject(lambda num_envs, seeds: worlds(Plain, num_envs, seeds)))
     except NotAsked as reason:
         assert "picture" in str(reason)  # noqa: PT017
+
+
+def test_what_a_world_keeps_is_no_memory_where_chance_alone_decides() -> None:
+    class Counting(Plain):
+        def _start(self, generator):
+            return super()._start(generator) | {"steps": self.draw(1, generator=generator)}
+
+        def _advance(self, world, action):
+            world["steps"] = world["steps"] + 1
+            return super()._advance(world, action + self.draw(2, 3))
+
+    with pytest.raises(NotAsked, match="the task has chance of its own"):
+        BY_NAME["set_state_reproduces_what_follows"](Subject(lambda count, seeds: worlds(Counting, count, seeds)))
 
 
 def test_a_task_that_raises_is_a_finding_too() -> None:
