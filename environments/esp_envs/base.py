@@ -19,7 +19,7 @@ from torch.nn.functional import pad
 from esp_envs.errors import UserError
 from esp_envs.scene import Painter, Scene
 from esp_envs.settings import TaskSettings
-from esp_envs.spec import Continuous, Discrete, TaskSpec
+from esp_envs.spec import Continuous, TaskSpec
 
 
 @dataclass(frozen=True)
@@ -262,15 +262,6 @@ class Environment(ABC):
         """Shape of a joint action: [S, E, N], and the width of a continuous one."""
         lead = (self.num_seeds, self.num_envs, self.spec.num_agents)
         return (*lead, self.spec.action.width) if isinstance(self.spec.action, Continuous) else lead
-
-    def _require_action(self, action: Tensor) -> None:
-        """Raise a UserError for a joint action of another shape, or of choices that are none; no GPU is waited for."""
-        require_shape("joint action", action, self.action_shape)
-        if not isinstance(self.spec.action, Discrete):
-            return
-        last, looked = self.spec.action.count - 1, action.device.type == "cpu"
-        if action.is_floating_point() or (looked and bool(((action < 0) | (action > last)).any())):
-            raise UserError(f"the joint action of {self.spec.name} holds other than the indices 0 to {last}")
 
     @property
     def state_shape(self) -> tuple[int, ...]:

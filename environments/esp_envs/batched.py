@@ -16,7 +16,7 @@ from esp_envs.spec import Discrete, TaskSpec
 
 World = dict[str, Tensor]  # all worlds' tensors by field of `spec.state`: [S, E, items, numbers of an item]
 Outcome = tuple[Tensor, dict[str, Tensor]]  # the reward [S, E] or [S, E, N] of a step and its metrics [S, E]
-_FURTHER = "world."  # what the names of saved tensors begin with that are no fields of the state
+FURTHER = "world."  # what the names of saved tensors begin with that are no fields of the state
 
 
 class BatchedTask(Environment):
@@ -105,7 +105,7 @@ class BatchedTask(Environment):
         return self._seen()
 
     def step(self, action: Tensor) -> Step:
-        self._require_action(action)
+        require_shape("joint action", action, self.action_shape)
         reward, metrics = self._play(action)
         reached, horizon = self._seen(), self.spec.horizon
         terminated = self._switched("_ended", "terminates", self._worlds_shape)
@@ -140,7 +140,7 @@ class BatchedTask(Environment):
     def load_state_dict(self, tensors: dict[str, Tensor]) -> None:
         shapes = {name: tensor.shape for name, tensor in tensors.items()}
         own = {name: value.shape for name, value in self.state_dict().items()}
-        if any(shapes.get(name) != shape for name, shape in own.items() if not name.startswith(_FURTHER)):
+        if any(shapes.get(name) != shape for name, shape in own.items() if not name.startswith(FURTHER)):
             raise UserError(OTHER_SIZE)
         super().load_state_dict(tensors)
         self._take_back({name: tensor.to(self.device) for name, tensor in tensors.items()})
@@ -261,13 +261,13 @@ class BatchedTask(Environment):
     def _to_save(self) -> dict[str, Tensor]:
         """Return the tensors that decide what follows, by the names under which they are saved."""
         fields = self.spec.state.slices()
-        further = {_FURTHER + name: value for name, value in self.world.items() if name not in fields}
+        further = {FURTHER + name: value for name, value in self.world.items() if name not in fields}
         return {"world": self._state()} | further
 
     def _take_back(self, saved: dict[str, Tensor]) -> None:
         """Take back the tensors of `_to_save`; their shapes are right."""
         self._put(saved["world"])
-        self.world |= {n.removeprefix(_FURTHER): saved[n].clone() for n in saved if n.startswith(_FURTHER)}
+        self.world |= {n.removeprefix(FURTHER): saved[n].clone() for n in saved if n.startswith(FURTHER)}
 
     def _put(self, state: Tensor) -> None:
         """Write a global state [S, E, state width] into the worlds."""

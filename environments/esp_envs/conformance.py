@@ -17,7 +17,10 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
+from torch import Tensor
 
+from esp_envs.base import Environment, Step
+from esp_envs.batched import FURTHER, BatchedTask
 from esp_envs.errors import UserError
 from esp_envs.installed import last_line, raised_in
 from esp_envs.promises import (
@@ -145,7 +148,7 @@ def an_environment_of_another_size_is_refused(subject: Subject) -> None:
 
 
 def set_state_reproduces_what_follows(subject: Subject) -> None:
-    """A state fixes observations and, where a task has no chance of its own, the next step."""
+    """A state fixes observations and, where a task has no chance of its own, the next step, whatever came before."""
     env, other, third = subject.worlds(), subject.worlds(seeds=(50, 60)), subject.worlds(seeds=(51, 61))
     require_method(env, "set_state", "the task cannot be put into a state")
     if env.spec.hidden:
@@ -154,6 +157,7 @@ def set_state_reproduces_what_follows(subject: Subject) -> None:
         raise NotAsked("an episode is one step")
     observation, _, _ = env.reset(), other.reset(), third.reset()
     for t in range(min(6, env.spec.horizon - 1)):
+        _give_another_past((other, third), observation.state)
         again, seen = (parts_of(worlds.set_state(observation.state)) for worlds in (other, third))
         if not nearly(again, seen, subject.rounding):
             raise NotAsked("what is seen has chance of its own")
@@ -163,16 +167,46 @@ def set_state_reproduces_what_follows(subject: Subject) -> None:
             subject.align(env, other, t)
             subject.align(env, third, t)
         action = env.random_action()
-        step, copy, twin = env.step(action), other.step(action), third.step(action)
-        if not nearly(tensors_of(copy), tensors_of(twin), subject.rounding):
+        step = env.step(action)
+        copy, twin, expected = (_before_a_new_start(made) for made in (other.step(action), third.step(action), step))
+        if not nearly(copy, twin, subject.rounding):
+            if isinstance(other, BatchedTask):
+                _require_no_memory(other, third, observation.state, subject.rounding)
             raise NotAsked("the task has chance of its own")
-        same = nearly(tensors_of(copy), tensors_of(step), subject.rounding)
         require(
-            same,
+            nearly(copy, expected, subject.rounding),
             "the step after 'set_state' differs from the one that the state had; "
             "put into the state what decides it, or name that in 'hidden' of the spec",
         )
         observation = step.next
+
+
+def _give_another_past(twins: Sequence[Environment], state: Tensor) -> None:
+    """Take twins one step from a state by an action of their own, so that they remember another past."""
+    for worlds in twins:
+        worlds.set_state(state)
+    action = twins[0].random_action()
+    for worlds in twins:
+        worlds.step(action)
+
+
+def _require_no_memory(env: Environment, twin: Environment, state: Tensor, rounding: float) -> None:
+    """Raise `Broken` where worlds of one state and chance part by what they keep beside it, which a step changes."""
+    env.set_state(state), twin.set_state(state)
+    before = env.state_dict()
+    twin.load_state_dict(twin.state_dict() | {"generators": before["generators"]})
+    first, second = (worlds.step(worlds.random_action()) for worlds in (env, twin))
+    if nearly(_before_a_new_start(first), _before_a_new_start(second), rounding):
+        return
+    for name, value in env.state_dict().items():
+        same = not name.startswith(FURTHER) or equal(value[~first.ended], before[name][~first.ended])
+        kept = name.removeprefix(FURTHER)
+        require(same, f"the world also keeps '{kept}', which a step changes; put it into the state or into 'hidden'")
+
+
+def _before_a_new_start(step: Step) -> list[Tensor]:
+    """Return the tensors of a step without the starts of episodes after it, which chance draws."""
+    return [*parts_of(step.reached), step.reward, *step.metrics.values(), step.terminated, step.truncated]
 
 
 def set_state_starts_an_episode(subject: Subject) -> None:

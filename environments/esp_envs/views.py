@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from esp_envs.base import Environment, Observation, Step, generators_for, joined
+from esp_envs.base import Environment, Observation, Step, generators_for, joined, require_shape
 from esp_envs.errors import UserError
 from esp_envs.promises import MakeWorlds
 from esp_envs.spec import Continuous, Field, Items, Kind, TaskSpec, joint_layout, layout
@@ -46,7 +46,7 @@ class RoleView(Environment):
         return self._seen(self.turns.reset(self.index))
 
     def step(self, action: Tensor) -> Step:
-        self._require_action(action)
+        require_shape("joint action", action, self.action_shape)
         step = self.turns.step(self.index, self.spec.action.admissible(action))
         return Step(
             next=self._seen(step.next),

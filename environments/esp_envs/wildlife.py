@@ -100,7 +100,7 @@ class Wildlife(BatchedTask):
 
     Heuristics: `surround` (all fly to the poacher; the nearest lands when another is beside it in the same step).
 
-    Anchors, convention `esp`, 7 x 7 cells, N = 3, return of an episode: random -2.78, surround 1.98.
+    Anchors, convention `esp`, 7 x 7 cells, N = 3, return of an episode: random -2.8, surround 2.0.
 
     Versions:
         1: first.

@@ -137,9 +137,16 @@ class LoadedPolicy(Shown):
         expected = (*lead, space.count)
         if action_mask is None:
             raise UserError(f"{self.spec.name} says which actions are allowed; give action_mask of shape {expected}")
-        mask = np.asarray(action_mask, bool)
-        if mask.shape != expected:
-            raise UserError(f"the action mask has shape {mask.shape}, expected {expected}")
+        try:
+            given = np.asarray(action_mask)
+        except (TypeError, ValueError):  # as for rows of unequal length
+            given = np.asarray(None)
+        if given.dtype.kind not in "biuf" or not np.isin(given, (0, 1)).all():
+            raise UserError("the action mask is not an array of booleans; give True for each action that is allowed")
+        if given.shape != expected:
+            raise UserError(f"the action mask has shape {given.shape}, expected {expected}")
+        if not (mask := given.astype(bool)).any(-1).all():
+            raise UserError("the action mask allows an agent nothing; leave it one action")
         return torch.from_numpy(mask.reshape(1, 1, -1, space.count))
 
     def _checked_obs(self, obs: ArrayLike) -> Floats:

@@ -235,6 +235,12 @@ def test_a_masked_policy_is_evaluated_and_loaded(tmp_path):
         policy.act(obs)
     with pytest.raises(ValueError, match=r"has shape \(5,\), expected \(7, 5\)"):
         policy.act(obs, action_mask=mask[0])
+    assert policy.act(obs, action_mask=mask.astype(float)).tolist() == [2] * 7
+    for wrong in (np.where(mask, 0.0, -np.inf), mask * np.nan, mask.astype(str), [[True], [True, False]]):
+        with pytest.raises(ValueError, match="the action mask is not an array of booleans"):
+            policy.act(obs, action_mask=wrong)
+    with pytest.raises(ValueError, match="allows an agent nothing"):
+        policy.act(obs, action_mask=mask & (np.arange(7) < 6)[:, None])
 
 
 def test_masks_need_discrete_actions():

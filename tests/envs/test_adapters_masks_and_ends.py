@@ -8,6 +8,7 @@ from esp_envs import Continuous, Discrete, Environment, Field, Kind, generators_
 from esp_envs.adapters.gymnasium import SingleAgentSettings, SingleAgentTask
 from esp_envs.adapters.pettingzoo import ParallelSettings, ParallelTask
 from esp_envs.conformance import Subject, check
+from esp_envs.promises import same_observation
 
 gymnasium = pytest.importorskip("gymnasium", reason="spaces come from the extra 'pettingzoo'")
 STEPS = 5
@@ -70,6 +71,19 @@ def worlds(cls: type[Environment], num_envs=5, seeds=(3, 7), **settings) -> Envi
 def test_the_corridor_keeps_every_promise(workers):
     subject = Subject(lambda count, seeds: worlds(Walkers, count, seeds, workers=workers))
     assert [finding.broken for finding in check(subject) if finding.broken] == []
+
+
+def test_fields_may_stand_beside_the_mask():
+    class Beside(Corridor):
+        def _seen(self):
+            return {
+                n: {"time": self.time, "action_mask": self._allowed(n), "place": self.places[n]} for n in self.agents
+            }
+
+    env, twin = (
+        worlds(cls, workers=0) for cls in (type("Flat", (Walkers,), {"make_one": lambda _: Beside()}), Walkers)
+    )
+    assert same_observation(env.reset(), twin.reset())
 
 
 def test_who_leaves_is_paid_once_and_the_other_goes_on():

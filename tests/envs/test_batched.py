@@ -199,7 +199,7 @@ def test_choices_that_are_none_are_refused(choice: torch.Tensor) -> None:
     env = make("navigation", 2, [0])
     env.reset()
     env.step(torch.full(env.action_shape, 4))
-    with pytest.raises(ValueError, match="joint action of navigation holds other than the indices 0 to 4"):
+    with pytest.raises(ValueError, match="joint action holds other than the indices 0 to 4"):
         env.step(choice.expand(env.action_shape))
 
 
@@ -375,6 +375,35 @@ class NoRestart(Plain):
         return seen
 
 
+class Rolling(Plain):
+    """It has a speed, which the state leaves out, from rest."""
+
+    def _start(self, generator):
+        return super()._start(generator) | {"speed": torch.zeros(self.num_envs, 2, 2)}
+
+    def _advance(self, world, action):
+        world["speed"] = world["speed"] + action[..., :2]
+        world["position"] = world["position"] + world["speed"]
+        return super()._advance(world, action)
+
+
+class RollingOn(Rolling):
+    """Its first speed is drawn."""
+
+    def _start(self, generator):
+        return super()._start(generator) | {"speed": self.draw(2, 2, generator=generator)}
+
+
+class RollingOut(Rolling):
+    """Its episodes end early, so that steps begin others, which chance draws."""
+
+    def _describe(self):
+        return replace(super()._describe(), terminates=True)
+
+    def _ended(self, world):
+        return world["position"].abs().amax((-1, -2)) > 1
+
+
 def plain(**methods: object) -> type[Environment]:
     return type("_".join(methods), (Plain,), methods)
 
@@ -429,7 +458,10 @@ BREAKERS = {
     "a_joint_action_of_the_wrong_shape_is_refused": [
         plain(step=lambda self, action: Plain.step(self, action.reshape(self.action_shape)))
     ],
-    "set_state_reproduces_what_follows": [plain(_put=lambda self, state: Plain._put(self, state * 2))],
+    "set_state_reproduces_what_follows": [
+        *(Rolling, RollingOn, RollingOut),
+        plain(_put=lambda self, state: Plain._put(self, state * 2)),
+    ],
     "set_state_starts_an_episode": [NoRestart],
     "a_scene_can_be_drawn": [
         plain(scene=lambda self, world=(0, 0): Scene((), (0, 1, 0, world[0] + 1))),
@@ -447,6 +479,19 @@ def test_a_task_that_breaks_a_promise_is_found(name: str, cls: type[Environment]
         BY_NAME[name](Subject(lambda num_envs, seeds: worlds(Plain, num_envs, seeds)))
     except NotAsked as reason:
         assert "picture" in str(reason)  # noqa: PT017
+
+
+def test_what_a_world_keeps_is_no_memory_where_chance_alone_decides() -> None:
+    class Counting(Plain):
+        def _start(self, generator):
+            return super()._start(generator) | {"steps": self.draw(1, generator=generator)}
+
+        def _advance(self, world, action):
+            world["steps"] = world["steps"] + 1
+            return super()._advance(world, action + self.draw(2, 3))
+
+    with pytest.raises(NotAsked, match="the task has chance of its own"):
+        BY_NAME["set_state_reproduces_what_follows"](Subject(lambda count, seeds: worlds(Counting, count, seeds)))
 
 
 def test_a_task_that_raises_is_a_finding_too() -> None:

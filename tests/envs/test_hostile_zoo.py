@@ -213,6 +213,12 @@ MADE = {
     "a box": (task(observation=spaces.Box(0, 1, (2,))), r"the observation of Zoo is a Box; give a layout"),
     "a space": (task(action=spaces.Discrete(3)), r"the action of Zoo is a Discrete; give Discrete\(...\) or"),
     "metrics as a text": (task(metrics=("hits")), r"the metrics of Zoo are a text; give a tuple: \('hits',\)"),
+    "totals as a text": (task(metrics=("hits",), totals="hits"), r"the totals of Zoo are a text; give .* \('hits',\)"),
+    "totals misspelt": (
+        task(metrics=("hits",), totals=("hit",)),
+        "the totals of Zoo name 'hit', but its metrics are hits",
+    ),
+    "masks of nobody": (task(masks={"agent": True}), "masks of Zoo names 'agent', but its roles are none"),
     "twins": (task(of={"possible_agents": ("a", "a")}), "'possible_agents' names an agent twice"),
     "agents by a method": (task(of={"possible_agents": lambda self: ["a"]}), "a Team, which has no 'possible_agents'"),
     "state as an array": (task(of={"state": np.zeros(2)}, state=Task.observation), "has no 'state' method"),

@@ -131,6 +131,12 @@ def test_cover_stands_between_two_landmarks() -> None:
     torch.testing.assert_close(goals[..., 0], torch.tensor([[0.0, 0.5], [5.0, 0.2]]))
 
 
+@pytest.mark.parametrize("wrong", [{"landmark_extent": 1e25}, {"density": 1e-30}])
+def test_lengths_whose_squares_no_float_holds_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=min(wrong)):
+        make("navigation", 1, [0], wrong)
+
+
 def test_cover_is_left_out_where_it_cannot_enumerate() -> None:
     assert make("navigation", 1, [0], {"num_agents": 4, "num_landmarks": 6}).heuristics == ("nearest", "cover", "blind")
     env = make("navigation", 1, [0], {"num_agents": 4, "num_landmarks": 7})

@@ -3,6 +3,7 @@
 import gc
 import os
 import signal
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import torch
 
 from esp_cli.training.build import build_learner
 from esp_cli.training.config import resolve_config
-from esp_envs import Continuous, Environment, Field, Kind, generators_for, layout, make, register
+from esp_envs import Continuous, Environment, Field, Kind, UserError, generators_for, layout, make, register
 from esp_envs.adapters.pettingzoo import ParallelSettings, ParallelTask
 from esp_envs.conformance import Subject, check
 from esp_envs.promises import same_step
@@ -265,6 +266,25 @@ def test_what_goes_wrong_in_a_worker_is_one_sentence(fault, sentence) -> None:
     with pytest.raises(ValueError, match=sentence) as caught:
         env.step(env.random_action())
     assert "\n" not in str(caught.value)
+
+
+def test_after_an_interruption_no_answer_of_that_step_is_taken_for_another() -> None:
+    env = worlds(Walking, workers=2)
+    env.reset()
+    ((_, first), *_) = env._copies._workers
+    os.kill(first.pid, signal.SIGSTOP)
+    before = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    signal.setitimer(signal.ITIMER_REAL, 0.2)
+    goes_on = threading.Timer(0.5, os.kill, [first.pid, signal.SIGCONT])
+    goes_on.start()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            env.step(env.random_action())
+    finally:
+        signal.signal(signal.SIGALRM, before)
+        goes_on.join()
+    with pytest.raises(UserError, match="were stopped; make the environment anew"):
+        env.step(env.random_action())
 
 
 def test_a_run_that_is_resumed_begins_the_episodes_that_a_reset_would_begin() -> None:

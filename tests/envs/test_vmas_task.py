@@ -166,8 +166,11 @@ UNTOLD = {
     "Flocking": {"the clock"},
     "JointPassage": {"angles to the last digit"},
     "JointPassageSize": {"angles to the last digit", "which passage is big"},
+    "Football": {"forces of the last step"},
+    "GiveWay": {"what controllers remember"},
+    "MultiGiveWay": {"what controllers remember"},
     "WindFlocking": {"what controllers remember"},
-    "MultiGiveWay": set(),  # all of it is in the state, and its worlds start alike
+    "ReverseTransport": set(),  # all of it is in the state, and its episodes may end in the first steps
 }
 
 

@@ -101,10 +101,18 @@ class WorkerCopies:
         self._command(b"place")
 
     def _command(self, word: bytes) -> None:
-        for pipe, _ in self._workers:
-            with contextlib.suppress(BrokenPipeError):  # the answer will be missing
-                pipe.send_bytes(word)
-        self._wait()
+        if not self._finalizer.alive:
+            raise UserError("the worker processes that step environments were stopped; make the environment anew")
+        try:
+            for pipe, _ in self._workers:
+                with contextlib.suppress(BrokenPipeError):  # the answer will be missing
+                    pipe.send_bytes(word)
+            self._wait()
+        except UserError:
+            raise  # after the answers of all
+        except BaseException:  # an answer that is still to come would be taken for that of the next command
+            self._finalizer()
+            raise
 
     def _wait(self) -> None:
         """Read one answer of every worker."""

@@ -96,7 +96,7 @@ class CopyHooks(ABC):
         Raises:
             UserError: a Dict space has no entry of a field's name.
         """
-        given = observation["observation"] if _has(observation, "action_mask") else observation
+        given = observation.get("observation", observation) if _has(observation, "action_mask") else observation
         if isinstance(given, Mapping):
             names = [field.name for field in self.kind_of(agent).observation.fields]
             if missing := next((name for name in names if name not in given), None):

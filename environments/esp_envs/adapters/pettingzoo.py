@@ -16,7 +16,7 @@ import torch
 from pydantic import Field as Setting
 from torch import Tensor
 
-from esp_envs.adapters import require_attributes, seed_of
+from esp_envs.adapters import require_attributes, require_roles, seed_of
 from esp_envs.adapters.attributes import deciding_attributes, simulated_layout
 from esp_envs.adapters.copies import FINAL, NOW, TERMINATED, TRUNCATED, Board, WorkerCopies
 from esp_envs.adapters.hooks import Copy, CopyHooks
@@ -63,6 +63,7 @@ class ParallelTask(CopyHooks, Environment):
     def __init__(self, settings: TaskSettings, num_envs: int, generators: Sequence[torch.Generator]) -> None:
         super().__init__(settings, num_envs, generators)
         require_attributes(self, "observation", "action", "symmetry", "convention")
+        require_roles(self, self.role_names)
         for name, kind in (("observation", Layout), ("action", ActionSpace), ("state", Layout | None)):
             self._require_kind(name, kind)
         one = Copy(self)
@@ -121,7 +122,7 @@ class ParallelTask(CopyHooks, Environment):
         return self._seen()
 
     def step(self, action: Tensor) -> Step:
-        self._require_action(action)
+        require_shape("joint action", action, self.action_shape)
         copies = self._started()
         board = copies.board
         board.action[:] = self.spec.admissible(action).flatten(0, 1).cpu().numpy()

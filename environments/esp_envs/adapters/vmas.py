@@ -13,7 +13,7 @@ import torch
 from pydantic import Field as Setting
 from torch import Tensor
 
-from esp_envs.adapters import require_attributes, seed_of, simulation
+from esp_envs.adapters import require_attributes, require_roles, seed_of, simulation
 from esp_envs.base import Environment, Observation, Step, joined, require_shape
 from esp_envs.errors import UserError
 from esp_envs.roles import Role, of_role, spec_with_roles
@@ -98,6 +98,7 @@ class VmasTask(Environment):
         given = self.seen()
         seen = given if isinstance(given, Mapping) else {"": given}
         self._groups = simulation.groups_of(self._sims[0].agents, list(seen) if isinstance(given, Mapping) else [])
+        require_roles(self, [name for name in seen if name])
         self._entities = simulation.Entities(self._sims[0], self.own_goals, self.flags, self.angles, self._groups)
         self.spec = spec_with_roles(
             [
@@ -141,7 +142,7 @@ class VmasTask(Environment):
         return _joined([self._begin(s) for s in range(self.num_seeds)])
 
     def step(self, action: Tensor) -> Step:
-        self._require_action(action)
+        require_shape("joint action", action, self.action_shape)
         force = self.spec.admissible(action) * self._range.unsqueeze(-1)
         reached, following, rewards, ends, measured = [], [], [], [], []
         self._time += 1

@@ -209,6 +209,7 @@ def _lidar(rays: int, name: str = "lidar") -> Field:
 
 
 _FINE = "angles to the last digit"  # which stiff joints feel
+_CONTROLLERS = "what controllers remember"
 
 BallPassage = _scenario("ball_passage", "from_goal", "from_ball", "from_passage", agents=2, fixed=True)
 BallTrajectory = _scenario("ball_trajectory", "from_ball", "again", agents=2, fixed=True, hidden=(_FINE,))
@@ -221,9 +222,10 @@ Football = _scenario(
     fixed=True,
     arguments=lambda _: {"ai_red_agents": False},
     seen=lambda _: {"agent_blue": _player("agent_red"), "agent_red": _player("agent_blue")},
+    hidden=("forces of the last step",),  # which players see
 )
 Flocking = _scenario("flocking", "from_target", _lidar(12), agents=4, hidden=("the clock",))
-GiveWay = _scenario("give_way", agents=2, fixed=True, own_goals="goal")
+GiveWay = _scenario("give_way", agents=2, fixed=True, own_goals="goal", hidden=(_CONTROLLERS,))
 JointPassage = _scenario(
     "joint_passage",
     *("from_goal", "from_passage", "goal_direction"),
@@ -240,7 +242,12 @@ JointPassageSize = _scenario(
     hidden=("which passage is big", _FINE),
 )
 MultiGiveWay = _scenario(
-    "multi_give_way", "from_goal", Field("distance", Kind.SCALAR), agents=4, fixed=True, own_goals="goal"
+    "multi_give_way",
+    *("from_goal", Field("distance", Kind.SCALAR)),
+    agents=4,
+    fixed=True,
+    own_goals="goal",
+    hidden=(_CONTROLLERS,),
 )
 Passage = _scenario("passage", "goal", "passage", agents=5, fixed=True, own_goals="goal")
 ReverseTransport = _scenario("reverse_transport", "package_velocity", "package", "package_from_goal", agents=4)
@@ -252,4 +259,4 @@ Wheel = _scenario(
     agents=4,
     reading=_with_direction(10),
 )
-WindFlocking = _scenario("wind_flocking", agents=2, fixed=True, hidden=("what controllers remember",))
+WindFlocking = _scenario("wind_flocking", agents=2, fixed=True, hidden=(_CONTROLLERS,))

@@ -42,6 +42,7 @@ class NavigationSettings(ParticleSettings):
     landmark_extent: float | None = Setting(
         None,
         gt=0,
+        le=1e6,
         description="landmarks start in the square [-extent, extent]^2 (lengths); 0.8 by default, 1.0 for pettingzoo",
     )
     local_ratio: float = Setting(

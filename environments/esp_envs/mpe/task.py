@@ -61,7 +61,7 @@ class ParticleSettings(TaskSettings):
     )
     density: float | None = Setting(
         None,
-        gt=0,
+        ge=1e-6,
         description="agents of the team per 2 x 2 lengths at the start, however many there are; by default all start "
         "in [-1, 1]^2. What else starts in a square grows with it",
     )
