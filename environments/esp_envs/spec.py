@@ -65,7 +65,7 @@ class Discrete:
         return len(self.points)
 
     def admissible(self, action: Tensor) -> Tensor:
-        """Return actions as the task takes them: as they are; a UserError refuses others, where no GPU is waited for."""
+        """Return actions as they are; a UserError refuses what is none, where no GPU is waited for."""
         known = action.device.type != "cpu" or not bool(((action < 0) | (action >= self.count)).any())
         if action.is_floating_point() or not known:
             raise UserError(f"the joint action holds other than the indices 0 to {self.count - 1}")
