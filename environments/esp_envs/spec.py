@@ -64,10 +64,13 @@ class Discrete:
         """A, the number of actions."""
         return len(self.points)
 
+    def holds(self, action: Tensor) -> bool:
+        """Return whether all are indices of actions."""
+        return not action.is_floating_point() and 0 <= int(action.min()) and int(action.max()) < self.count
+
     def admissible(self, action: Tensor) -> Tensor:
         """Return actions as they are; a UserError refuses what is none, where no GPU is waited for."""
-        known = action.device.type != "cpu" or not bool(((action < 0) | (action >= self.count)).any())
-        if action.is_floating_point() or not known:
+        if action.is_floating_point() or (action.device.type == "cpu" and not self.holds(action)):
             raise UserError(f"the joint action holds other than the indices 0 to {self.count - 1}")
         return action
 

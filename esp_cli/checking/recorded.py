@@ -143,10 +143,9 @@ def require_told(spaces: Spaces, data: Transitions) -> None:
     for name in ("obs", "action", "reward", "next_obs"):
         if not bool(getattr(data, name).isfinite().all()):
             raise UserError(f"'{name}' of the transitions holds numbers that are not finite; leave those episodes out")
-    if isinstance(spaces.action, Discrete):
-        count, action = spaces.action.count, data.action
-        if action.is_floating_point() or not bool(((action >= 0) & (action < count)).all()):
-            raise UserError(f"'action' of the transitions holds other than the indices 0 to {count - 1}; give indices")
+    if isinstance(spaces.action, Discrete) and not spaces.action.holds(data.action):
+        last = spaces.action.count - 1
+        raise UserError(f"'action' of the transitions holds other than the indices 0 to {last}; give indices")
 
 
 def read_transitions(path: Path, spaces: Spaces) -> Transitions:
