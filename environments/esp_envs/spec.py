@@ -66,11 +66,11 @@ class Discrete:
 
     def holds(self, action: Tensor) -> bool:
         """Return whether all are indices of actions."""
-        return not action.is_floating_point() and 0 <= int(action.min()) and int(action.max()) < self.count
+        return not action.is_floating_point() and int(action.min()) >= 0 and int(action.max()) < self.count
 
     def admissible(self, action: Tensor) -> Tensor:
         """Return actions as they are; a UserError refuses what is none, where no GPU is waited for."""
-        if action.is_floating_point() or (action.device.type == "cpu" and not self.holds(action)):
+        if not (self.holds(action) if action.device.type == "cpu" else not action.is_floating_point()):
             raise UserError(f"the joint action holds other than the indices 0 to {self.count - 1}")
         return action
 
